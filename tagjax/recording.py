@@ -1,0 +1,327 @@
+"""The Recording: what a camera and a reader saw, with optional truth, on the host and opened lazily.
+
+Everything here is NumPy (or a lazily read Zarr array); nothing touches a device. Times are int64 nanoseconds of the
+host clock. `Recording.check` holds a recording against what every later stage relies on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from ._types import LazyArray
+
+MAX_RANGE_M = 30.0
+"""Depth beyond this is taken for a wrong unit: no RGB-D camera of the kind reaches it."""
+
+
+class RecordingError(ValueError):
+    """A recording that cannot be used: what was found, what was expected, what to do."""
+
+
+class RecordingWarning(UserWarning):
+    """A recording that can be used although something about it is unusual."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera: focal lengths and principal point in pixels; distortion in OpenCV's order (k1 k2 p1 p2 k3)."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+
+    def scaled(self, stride: int) -> Intrinsics:
+        """Intrinsics of every `stride`-th pixel, the first kept: pixel i of the result is pixel i * stride."""
+        return dataclasses.replace(
+            self,
+            fx_px=self.fx_px / stride,
+            fy_px=self.fy_px / stride,
+            cx_px=self.cx_px / stride,
+            cy_px=self.cy_px / stride,
+            width=-(-self.width // stride),
+            height=-(-self.height // stride),
+        )
+
+    def matrix(self) -> np.ndarray:
+        """The 3x3 camera matrix."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]], dtype=np.float64)
+
+
+@dataclasses.dataclass(frozen=True)
+class TagReads:
+    """Tag reads in order of host time, one array element a read.
+
+    `carrier_hz` is NaN where the carrier is unknown (a channel index without its hop table); `doppler_hz` and
+    `rssi_dbm` are NaN where the reader gave none. `phase_rad` is as reported, in [0, phase_period_rad); it grows with
+    distance where `phase_sign` is +1 (Impinj), shrinks where it is -1.
+    """
+
+    epc: np.ndarray  # (num_reads,) str
+    time_ns: np.ndarray  # (num_reads,) int64, host clock
+    antenna: np.ndarray  # (num_reads,) int16, counted from 1
+    carrier_hz: np.ndarray  # (num_reads,) float64
+    phase_rad: np.ndarray  # (num_reads,) float64
+    rssi_dbm: np.ndarray  # (num_reads,) float32
+    doppler_hz: np.ndarray  # (num_reads,) float32
+    reader_time_ns: np.ndarray | None = None  # (num_reads,) int64, reader clock
+    channel_index: np.ndarray | None = None  # (num_reads,) int16, counted from 1 into hop_table_hz
+    hop_table_hz: tuple[float, ...] = ()
+    phase_period_rad: float = 2 * np.pi
+    phase_sign: Literal[-1, 1] = 1
+    pi_flips: bool | None = None  # None = unknown: estimators decide from the reads
+
+    @property
+    def num_reads(self) -> int:
+        return len(self.time_ns)
+
+    @property
+    def epcs(self) -> list[str]:
+        """The EPCs that were read, sorted."""
+        return sorted({str(epc) for epc in self.epc})
+
+    def __getitem__(self, index: Any) -> TagReads:
+        """The reads that a mask, slice or index array selects."""
+        columns = {
+            field.name: getattr(self, field.name)[index]
+            for field in dataclasses.fields(self)
+            if isinstance(getattr(self, field.name), np.ndarray)
+        }
+        return dataclasses.replace(self, **columns)
+
+    def select(self, epc: str) -> TagReads:
+        """The reads of one tag. An EPC that was never read raises `RecordingError`."""
+        found = self.epc == epc
+        if not found.any():
+            known = ", ".join(self.epcs) or "none"
+            raise RecordingError(f"EPC {epc!r} was never read. EPCs in this recording: {known}. Name one of these.")
+        return self[found]
+
+    @classmethod
+    def empty(cls) -> TagReads:
+        """No reads at all."""
+        return cls(
+            epc=np.empty(0, dtype="<U24"),
+            time_ns=np.empty(0, dtype=np.int64),
+            antenna=np.empty(0, dtype=np.int16),
+            carrier_hz=np.empty(0, dtype=np.float64),
+            phase_rad=np.empty(0, dtype=np.float64),
+            rssi_dbm=np.empty(0, dtype=np.float32),
+            doppler_hz=np.empty(0, dtype=np.float32),
+        )
+
+    def check(self) -> None:
+        """Raise `RecordingError` for reads that cannot be used; warn of those that can be, unusual as they are."""
+        num_reads = self.num_reads
+        for field in dataclasses.fields(self):
+            column = getattr(self, field.name)
+            if isinstance(column, np.ndarray) and column.shape != (num_reads,):
+                raise RecordingError(
+                    f"Tag reads: column {field.name} has shape {column.shape}; expected ({num_reads},) as time_ns has."
+                )
+        if num_reads == 0:
+            warnings.warn("The recording holds no tag read: nothing can be traced.", RecordingWarning, stacklevel=3)
+            return
+        if np.any(np.diff(self.time_ns) < 0):
+            first = int(np.argmax(np.diff(self.time_ns) < 0)) + 1
+            raise RecordingError(
+                f"Tag reads: time goes back at read {first}; expected reads in order of time. "
+                "Sort them (the importers do)."
+            )
+        for name, limit, unit in (("phase_rad", self.phase_period_rad + 1e-6, "rad"),):
+            column = getattr(self, name)
+            if not np.all(np.isfinite(column)):
+                bad = int(np.sum(~np.isfinite(column)))
+                raise RecordingError(f"Tag reads: {bad} of {num_reads} values of {name} are not finite; drop them.")
+            if column.min() < -1e-6 or column.max() > limit:
+                raise RecordingError(
+                    f"Tag reads: {name} spans [{column.min():.4g}, {column.max():.4g}]; expected [0, {limit:.4g}] {unit}. "
+                    "Degrees or raw codes must be converted first."
+                )
+        known = np.isfinite(self.carrier_hz)
+        if not known.all():
+            warnings.warn(
+                f"The carrier of {int(np.sum(~known))} of {num_reads} reads is unknown (a channel index needs the "
+                "reader's hop table): these reads carry no distance.",
+                RecordingWarning,
+                stacklevel=3,
+            )
+        carriers = self.carrier_hz[known]
+        if carriers.size and (carriers.min() < 300e6 or carriers.max() > 6e9):
+            raise RecordingError(
+                f"Tag reads: carrier_hz spans [{carriers.min():.4g}, {carriers.max():.4g}]; expected a UHF carrier in Hz, "
+                "about 9e8. MHz or kHz must be converted first."
+            )
+        if carriers.size and carriers.max() - carriers.min() > 120e6:
+            raise RecordingError(
+                f"Tag reads: carriers from {carriers.min() / 1e6:.1f} to {carriers.max() / 1e6:.1f} MHz are mixed; one "
+                "reader's band spans at most about 100 MHz. Import each reader by itself."
+            )
+        rssi = self.rssi_dbm[np.isfinite(self.rssi_dbm)]
+        if rssi.size and (rssi.min() < -120 or rssi.max() > 20):
+            raise RecordingError(
+                f"Tag reads: rssi_dbm spans [{rssi.min():.4g}, {rssi.max():.4g}]; expected dBm between -120 and 20. "
+                "Centi-dBm must be divided by 100 first."
+            )
+        if np.any(self.antenna < 1):
+            raise RecordingError(f"Tag reads: antenna {int(self.antenna.min())} found; antennas are counted from 1.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """What is known to be true. Every part is optional; a lazily read array stays unread until indexed."""
+
+    labels: LazyArray | None = None  # (num_frames, height, width) uint8: 0 background, 255 ignore, else an object
+    tag_to_label: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    boxes_px: np.ndarray | None = None  # (num_frames, num_labels, 4) float32 x0 y0 x1 y1 inclusive; NaN = unseen
+    tag_range_m: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,), NaN unknown
+    tag_position_m: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames, 3) camera
+    visible: Mapping[int, np.ndarray] = dataclasses.field(default_factory=dict)  # label: (num_frames,) bool
+    flow_px: LazyArray | None = None  # (num_frames, height, width, 2) flow from frame t to t + 1; last one NaN
+    occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is hidden
+
+    IGNORE = 255
+
+
+@dataclasses.dataclass(frozen=True)
+class ClockAudit:
+    """How the reader's clock relates to the host's: host = reader + offset + drift * (reader - first reader time)."""
+
+    offset_s: float
+    drift_ppm: float
+    residual_ms: float
+    num_reads: int
+    reader_epoch: str  # "unix", "1970" or "2000": the latter two say that the reader's clock was never set
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """One RGB-D video with its tag reads.
+
+    `depth` holds millimetres as uint16, or metres as float32; 0 (or NaN) = missing. It is z-depth or range to the
+    camera, as `depth_kind` says, in the view of the colour camera whose `intrinsics` these are. `antennas_m` are
+    antenna positions in the camera frame (x right, y down, z forward), row i for antenna i + 1.
+    """
+
+    colour: LazyArray  # (num_frames, height, width, 3) uint8 RGB
+    depth: LazyArray  # (num_frames, height, width)
+    time_ns: np.ndarray  # (num_frames,) int64 host clock
+    intrinsics: Intrinsics
+    reads: TagReads
+    antennas_m: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((1, 3)))  # (num_antennas, 3)
+    depth_kind: Literal["depth", "range"] = "depth"
+    truth: Truth | None = None
+    clock: ClockAudit | None = None
+    name: str = "recording"
+    source: str = ""  # what it was made from, and how
+    store: Any = None  # the open Zarr group, where it comes from one
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.time_ns)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        return (self.intrinsics.height, self.intrinsics.width)
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Median frame rate; NaN for a single frame."""
+        return float(1e9 / np.median(np.diff(self.time_ns))) if self.num_frames > 1 else float("nan")
+
+    def frame_time_s(self) -> np.ndarray:
+        """Frame times in seconds from the first frame, float64."""
+        return (self.time_ns - self.time_ns[0]) * 1e-9
+
+    def depth_metres(self, frames: int | slice) -> np.ndarray:
+        """Raw depth values (z or range, as `depth_kind` says) in metres, float32, 0 where missing."""
+        raw = np.asarray(self.depth[frames])
+        metres = raw.astype(np.float32) * np.float32(1e-3 if raw.dtype.kind in "ui" else 1.0)
+        return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
+
+    def resolve_epcs(self, epcs: Sequence[str] | None) -> list[str]:
+        """The given EPCs, each checked to have been read; all that were read if None."""
+        if epcs is None:
+            return self.reads.epcs
+        for epc in epcs:
+            self.reads.select(epc)
+        return list(epcs)
+
+    def with_reads(self, reads: TagReads, truth: Truth | None = None) -> Recording:
+        """The same video with other reads (and, if given, other truth)."""
+        return dataclasses.replace(self, reads=reads, truth=self.truth if truth is None else truth)
+
+    def check(self) -> None:
+        """Raise `RecordingError` where a later stage could not go on; warn where it can.
+
+        Reads frame metadata and three depth frames only, so that it stays cheap for a remote recording.
+        """
+        num_frames, shape = self.num_frames, self.image_shape
+        if num_frames == 0:
+            raise RecordingError(f"{self.name}: no frame. A recording needs at least one.")
+        if self.colour.shape != (num_frames, *shape, 3) or self.colour.dtype != np.uint8:
+            raise RecordingError(
+                f"{self.name}: colour is {self.colour.dtype} of shape {self.colour.shape}; expected uint8 of shape "
+                f"{(num_frames, *shape, 3)} (frames, height, width, RGB) as times and intrinsics say."
+            )
+        if self.depth.shape != (num_frames, *shape):
+            raise RecordingError(
+                f"{self.name}: depth has shape {self.depth.shape}; expected {(num_frames, *shape)}, registered to colour. "
+                "Use geometry.register_depth for a depth camera beside the colour camera."
+            )
+        if np.dtype(self.depth.dtype) not in (np.dtype(np.uint16), np.dtype(np.float32)):
+            raise RecordingError(f"{self.name}: depth is {self.depth.dtype}; expected uint16 mm or float32 m.")
+        steps = np.diff(self.time_ns)
+        if np.any(steps <= 0):
+            first = int(np.argmax(steps <= 0)) + 1
+            raise RecordingError(
+                f"{self.name}: frame {first} is stamped {int(-steps[first - 1]) / 1e6:.3f} ms before or at frame {first - 1}; "
+                "expected strictly increasing times. Drop or re-stamp the frame."
+            )
+        if self.antennas_m.ndim != 2 or self.antennas_m.shape[1] != 3 or not np.all(np.isfinite(self.antennas_m)):
+            raise RecordingError(
+                f"{self.name}: antennas_m has shape {self.antennas_m.shape}; expected finite (antennas, 3) metres."
+            )
+        self._check_depth_values()
+        self.reads.check()
+        if self.reads.num_reads:
+            highest = int(self.reads.antenna.max())
+            if highest > len(self.antennas_m):
+                raise RecordingError(
+                    f"{self.name}: reads of antenna {highest}, but antennas_m places {len(self.antennas_m)}. Give all places."
+                )
+            inside = (self.reads.time_ns >= self.time_ns[0]) & (self.reads.time_ns <= self.time_ns[-1])
+            if not inside.any():
+                gap_s = (int(self.reads.time_ns[0]) - int(self.time_ns[0])) * 1e-9
+                raise RecordingError(
+                    f"{self.name}: no read falls between the first and the last frame (first read {gap_s:+.1f} s from the "
+                    "first frame). Reader and camera clocks differ: import with clock=arrival or give clock_offset_s."
+                )
+
+    def _check_depth_values(self) -> None:
+        sampled = sorted({0, self.num_frames // 2, self.num_frames - 1})
+        values = np.stack([self.depth_metres(frame) for frame in sampled])
+        measured = values[values > 0]
+        if measured.size == 0:
+            raise RecordingError(
+                f"{self.name}: frames {sampled} hold no depth at all; TagAttention needs depth. Was it exported?"
+            )
+        if np.median(measured) > MAX_RANGE_M or np.median(measured) < 0.05:
+            raise RecordingError(
+                f"{self.name}: median depth {np.median(measured):.4g} m; expected 0.05 to {MAX_RANGE_M:g}. Wrong unit? uint16 "
+                "is read as millimetres, float32 as metres (TUM's PNG files hold 1/5000 m)."
+            )
+        for frame, image in zip(sampled, values, strict=True):
+            if not np.any(image > 0):
+                warnings.warn(
+                    f"{self.name}: frame {frame} has no depth; it is carried.", RecordingWarning, stacklevel=4
+                )

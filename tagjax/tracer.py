@@ -1,0 +1,69 @@
+"""Tracers: what every tracing system offers, and the one scan that runs any of them over a clip."""
+
+from __future__ import annotations
+
+import abc
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Bool, Float
+
+from .rf.reads import PhaseReads, RadioWindow
+
+
+class Camera(eqx.Module):
+    """The camera at the working resolution, and the antenna beside it."""
+
+    rays: Float[Array, "height width 3"]  # ((x - cx) / fx, (y - cy) / fy, 1): point = depth * ray
+    antenna_m: Float[Array, " 3"]  # antenna position, camera frame
+
+
+class Frame(eqx.Module):
+    """What a tracer sees at one frame; in a clip every leaf has a leading time axis.
+
+    Flow at t is between frames t - 1 and t, pixels of the working resolution; the first frame's is zero.
+    `backward_px` sits on frame t and points to t - 1 (for gathering), `forward_px` sits on t - 1 and points to t (for
+    splatting).
+    """
+
+    time_s: Float[Array, "*time"]
+    depth_m: Float[Array, "*time height width"]  # z, 0 = missing
+    backward_px: Float[Array, "*time height width 2"]
+    forward_px: Float[Array, "*time height width 2"]
+    radio: RadioWindow  # (*time, tag, window): causal, from reads up to this frame
+    reads: PhaseReads  # (*time, tag, read): the reads that fall into this frame's window
+
+
+class Trace(eqx.Module):
+    """What a tracer says of every tag at one frame; `trace` stacks it over time."""
+
+    mask: Float[Array, "*time tag height width"]  # soft mask, 0 to 1
+    box_px: Float[Array, "*time tag 4"]  # x0 y0 x1 y1, inclusive pixel edges at the working resolution
+    centre_px: Float[Array, "*time tag 2"]  # x y of the mask's centroid
+    centre_m: Float[Array, "*time tag 3"]  # camera frame
+    step_m: Float[Array, "*time tag"]  # change of the object's distance to the antenna since the last frame
+    confidence: Float[Array, "*time tag"]  # 0 to 1
+    found: Bool[Array, "*time tag"]  # an object is claimed at all
+
+
+class AbstractTracer(eqx.Module):
+    """A tracing system as a state machine of fixed shapes: `init`, one `step` a frame, `finish`."""
+
+    @abc.abstractmethod
+    def init(self, camera: Camera, frame: Frame) -> eqx.AbstractVar | object:
+        """The state before the first frame; `frame` (no time axis) tells shapes only."""
+
+    @abc.abstractmethod
+    def step(self, camera: Camera, state, frame: Frame):
+        """The next state, and the `Trace` of this frame."""
+
+    @abc.abstractmethod
+    def finish(self, state):
+        """The state handed on to whoever continues the recording: nothing in it refers to a past frame's buffer."""
+
+
+def trace(tracer: AbstractTracer, camera: Camera, clip: Frame) -> Trace:
+    """Run a tracer over a clip (leading time axis) with one `lax.scan`; memory of the state does not grow."""
+    first = jax.tree.map(lambda leaf: leaf[0], clip)
+    _, out = jax.lax.scan(lambda state, frame: tracer.step(camera, state, frame), tracer.init(camera, first), clip)
+    return out
