@@ -7,7 +7,7 @@ integers. SI units, named by the last suffix of a variable: ``depth_m``, ``phase
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -29,6 +29,7 @@ PixelMask: TypeAlias = Bool[Array, "height width"]
 Metadata: TypeAlias = Mapping[str, Any]
 
 
+@runtime_checkable
 class LazyArray(Protocol):
     """What a stored array offers without being read: NumPy and Zarr arrays both do."""
 
@@ -38,4 +39,4 @@ class LazyArray(Protocol):
     @property
     def dtype(self) -> Any: ...
 
-    def __getitem__(self, index: Any, /) -> np.ndarray[Any, Any]: ...
+    def __getitem__(self, index: Any, /) -> np.ndarray: ...
