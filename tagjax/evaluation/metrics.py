@@ -1,0 +1,227 @@
+"""Tracking metrics against labelled truth: box IoU, centre error, mask J, identification, time to lock.
+
+Host-side NumPy. Every metric comes per frame with a validity mask, and is summed up as state -> merge -> result, so
+that clips, tags and recordings can be scored one by one and put together afterwards.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Integer, Shaped
+
+from ..recording import Truth
+
+REFERENCE_WIDTH_PX = 512
+"""Centre errors are given for a picture of this width (Kinect v2's depth camera, as in TagAttention)."""
+
+
+def box_iou(
+    box_a_px: Shaped[np.ndarray, "*batch 4"], box_b_px: Shaped[np.ndarray, "*batch 4"]
+) -> Float[np.ndarray, "*batch"]:
+    """Intersection over union of boxes x0 y0 x1 y1 with inclusive pixel edges (TagAttention, Eq. 8).
+
+    Pixels have unit size, so a box spans x1 - x0 + 1. 0 where either box is NaN or turned inside out.
+    """
+    a, b = np.asarray(box_a_px, np.float64), np.asarray(box_b_px, np.float64)
+    side_a, side_b = a[..., 2:] - a[..., :2] + 1.0, b[..., 2:] - b[..., :2] + 1.0
+    with np.errstate(invalid="ignore"):
+        overlap = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]) + 1.0
+        proper = np.all(side_a > 0, axis=-1) & np.all(side_b > 0, axis=-1)
+        intersection = np.prod(np.maximum(overlap, 0.0), axis=-1)
+        union = np.prod(side_a, axis=-1) + np.prod(side_b, axis=-1) - intersection
+    return np.where(proper, np.divide(intersection, union, out=np.zeros_like(union), where=proper & (union > 0)), 0.0)
+
+
+def centre_error(
+    box_a_px: Shaped[np.ndarray, "*batch 4"], box_b_px: Shaped[np.ndarray, "*batch 4"], width: int
+) -> Float[np.ndarray, "*batch"]:
+    """Distance between box centres in pixels of a 512-pixel-wide picture; NaN where a box is NaN.
+
+    `width` is that of the picture the boxes are measured in.
+    """
+    a, b = np.asarray(box_a_px, np.float64), np.asarray(box_b_px, np.float64)
+    gap = 0.5 * (a[..., :2] + a[..., 2:] - b[..., :2] - b[..., 2:])
+    return np.asarray(np.linalg.norm(gap, axis=-1) * (REFERENCE_WIDTH_PX / width))
+
+
+def mask_iou(mask: Bool[np.ndarray, "height width"], labels: Integer[np.ndarray, "height width"], label: int) -> float:
+    """Region similarity J: IoU of a mask with a labelled object, pixels labelled 255 (ignore) left out of both.
+
+    NaN where neither holds a pixel.
+    """
+    counted = labels != Truth.IGNORE
+    predicted, true = mask & counted, labels == label
+    union = int(np.sum(predicted | true))
+    return float(np.sum(predicted & true) / union) if union else float("nan")
+
+
+def most_covered(
+    mask: Bool[np.ndarray, "height width"], labels: Integer[np.ndarray, "height width"], *, min_pixels: int = 20
+) -> int:
+    """The labelled object of which the mask covers the largest part; 0 if it covers none.
+
+    Objects that show fewer than `min_pixels` are passed over: a sliver is covered by chance.
+    """
+    shown = np.bincount(labels.reshape(-1), minlength=256).astype(np.float64)
+    covered = np.bincount(labels[mask], minlength=256).astype(np.float64)
+    shown[[0, Truth.IGNORE]] = covered[[0, Truth.IGNORE]] = 0
+    part = np.where(shown >= min_pixels, covered / np.maximum(shown, 1.0), 0.0)
+    return int(np.argmax(part)) if part.max() > 0 else 0
+
+
+def label_box(labels: Integer[np.ndarray, "height width"], label: int) -> Float[np.ndarray, " 4"]:
+    """Tight box x0 y0 x1 y1 (inclusive) around a labelled object; NaN if it does not show."""
+    found = labels == label
+    rows, columns = np.flatnonzero(found.any(axis=1)), np.flatnonzero(found.any(axis=0))
+    if not len(rows):
+        return np.full(4, np.nan)
+    return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.float64)
+
+
+def touches_border(box_px: Shaped[np.ndarray, "*batch 4"], height: int, width: int) -> Bool[np.ndarray, "*batch"]:
+    """Whether a box reaches the outermost pixels of the picture, where the object may be cut off."""
+    x0, y0, x1, y1 = np.moveaxis(np.asarray(box_px), -1, 0)
+    return np.asarray((x0 <= 0) | (y0 <= 0) | (x1 >= width - 1) | (y1 >= height - 1))
+
+
+def time_to_lock(
+    iou: Float[np.ndarray, " time"],
+    valid: Bool[np.ndarray, " time"],
+    time_s: Float[np.ndarray, " time"],
+    *,
+    threshold: float = 0.5,
+    num_frames: int = 5,
+) -> float:
+    """Seconds from the first valid frame to the first of `num_frames` valid frames in a row with IoU >= threshold.
+
+    Invalid frames are skipped: they neither break nor lengthen the row. Infinite if the object is never locked, NaN
+    without a valid frame.
+    """
+    frames = np.flatnonzero(valid)
+    if not len(frames):
+        return float("nan")
+    good = np.asarray(iou)[frames] >= threshold
+    row = 0
+    for i, locked in enumerate(good):
+        row = row + 1 if locked else 0
+        if row == num_frames:
+            return float(time_s[frames[i - num_frames + 1]] - time_s[frames[0]])
+    return float("inf")
+
+
+def moved_for(
+    truth: Truth, epc: str, time_s: Float[np.ndarray, " time"], seconds: float, *, min_speed_m_s: float = 0.1
+) -> Bool[np.ndarray, " time"]:
+    """Frames by which the tag has moved for `seconds` in total since the recording's start.
+
+    Speed is that of the true position, or of the true range where no position is known; frames where neither is known
+    add nothing. Without any such truth every frame counts, if `seconds` is 0; else none does.
+    """
+    if seconds <= 0:
+        return np.ones(len(time_s), dtype=bool)
+    if epc in truth.tag_position_m:
+        place = np.asarray(truth.tag_position_m[epc], np.float64)
+    elif epc in truth.tag_range_m:
+        place = np.asarray(truth.tag_range_m[epc], np.float64)[:, None]
+    else:
+        return np.zeros(len(time_s), dtype=bool)
+    step_s = np.diff(time_s, prepend=time_s[:1])
+    step_m = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moving = np.nan_to_num(step_m / step_s) > min_speed_m_s
+    return np.cumsum(np.where(moving, step_s, 0.0)) >= seconds - 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskedMean:
+    """A mean over valid elements as a state that can be merged; its result is NaN without any."""
+
+    total: float = 0.0
+    count: int = 0
+
+    @classmethod
+    def of(cls, values: Shaped[np.ndarray, "*shape"], valid: Bool[np.ndarray, "*shape"]) -> MaskedMean:
+        """The state of these values; NaN values count as invalid."""
+        values = np.asarray(values, np.float64)
+        kept = values[valid & np.isfinite(values)]
+        return cls(float(kept.sum()), len(kept))
+
+    def merge(self, other: MaskedMean) -> MaskedMean:
+        return MaskedMean(self.total + other.total, self.count + other.count)
+
+    def result(self) -> float:
+        return self.total / self.count if self.count else float("nan")
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameScores:
+    """One tag's scores at every frame, before any selection."""
+
+    time_s: Float[np.ndarray, " time"]
+    iou: Float[np.ndarray, " time"]
+    cle_px: Float[np.ndarray, " time"]
+    mask_j: Float[np.ndarray, " time"]
+    identified: Int[np.ndarray, " time"]  # the label most covered by the mask, 0 = none
+    confidence: Float[np.ndarray, " time"]
+    found: Bool[np.ndarray, " time"]  # the tracer claims an object
+    shown: Bool[np.ndarray, " time"]  # the truth shows the object whole
+    moved: Bool[np.ndarray, " time"]  # it has moved for long enough to be told apart
+    label: int
+
+    @property
+    def valid(self) -> Bool[np.ndarray, " time"]:
+        return self.shown & self.moved
+
+
+@dataclasses.dataclass(frozen=True)
+class Scores:
+    """Summed scores of any number of tags. A frame without a claim counts as IoU 0 and as not identified; its centre
+    error is undefined and left out, so read `cle_px` together with `found`."""
+
+    means: Mapping[str, MaskedMean] = dataclasses.field(default_factory=dict)
+    lock_s: tuple[float, ...] = ()  # one element a tag that was shown
+
+    @classmethod
+    def of(cls, frames: FrameScores, *, threshold: float = 0.5, lock_frames: int = 5) -> Scores:
+        """The state of one tag."""
+        valid, found = frames.valid, frames.found
+        iou = np.where(found, frames.iou, 0.0)
+        columns = {
+            "iou": iou,
+            "cle_px": np.where(found, frames.cle_px, np.nan),
+            "mask_j": np.where(found, frames.mask_j, 0.0),
+            "identification": (found & (frames.identified == frames.label)).astype(np.float64),
+            "success": (iou >= threshold).astype(np.float64),
+            "found": found.astype(np.float64),
+            "confidence": frames.confidence,
+        }
+        lock = time_to_lock(iou, frames.shown, frames.time_s, threshold=threshold, num_frames=lock_frames)
+        return cls(
+            {name: MaskedMean.of(values, valid) for name, values in columns.items()},
+            () if np.isnan(lock) else (lock,),
+        )
+
+    def merge(self, other: Scores) -> Scores:
+        names = {**self.means, **other.means}
+        return Scores(
+            {name: self.means.get(name, MaskedMean()).merge(other.means.get(name, MaskedMean())) for name in names},
+            self.lock_s + other.lock_s,
+        )
+
+    def result(self) -> dict[str, float | int | None]:
+        """Named means, the count of frames they stand on, share of tags locked, median time to lock of those.
+
+        Undefined numbers are None, so that the result is plain JSON.
+        """
+        numbers: dict[str, float | int | None] = {}
+        for name, mean in self.means.items():
+            numbers[name] = mean.result() if mean.count else None
+        locked = [lock for lock in self.lock_s if np.isfinite(lock)]
+        numbers["num_frames"] = max((mean.count for mean in self.means.values()), default=0)
+        numbers["num_tags"] = len(self.lock_s)
+        numbers["locked"] = len(locked) / len(self.lock_s) if self.lock_s else None
+        numbers["time_to_lock_s"] = float(np.median(locked)) if locked else None
+        return numbers
