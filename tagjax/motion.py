@@ -1,0 +1,81 @@
+"""Motion maps (TagAttention, Eq. 3): every pixel's distance over the last k frames, carried along by optical flow."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .image.warp import gather, gather_taps, splat
+
+
+class MotionMap(eqx.Module):
+    """Distances to the antenna over a window of frames, oldest first; the last is the current frame's."""
+
+    distance_m: Float[Array, "height width window"]
+    valid: Bool[Array, "height width window"]
+
+
+def empty_motion(height: int, width: int, num_window: int) -> MotionMap:
+    """A motion map that knows nothing yet."""
+    return MotionMap(jnp.zeros((height, width, num_window)), jnp.zeros((height, width, num_window), dtype=bool))
+
+
+def _append(
+    past_m: Float[Array, "height width past"],
+    past_valid: Bool[Array, "height width past"],
+    distance_m: Float[Array, "height width"],
+) -> MotionMap:
+    return MotionMap(
+        jnp.concatenate([past_m, distance_m[..., None]], axis=-1),
+        jnp.concatenate([past_valid, (distance_m > 0)[..., None]], axis=-1),
+    )
+
+
+def push_splat(
+    motion: MotionMap, forward_px: Float[Array, "height width 2"], distance_m: Float[Array, "height width"]
+) -> MotionMap:
+    """Slide the window by one frame, carrying the past forward along the flow (Eq. 3 as the paper has it).
+
+    One splat of k - 1 channels does what Eq. 3 writes as k nested warps. Each channel carries its own validity:
+    missing distances neither spread nor dilute their neighbours.
+    """
+    past, valid = motion.distance_m[..., 1:], motion.valid[..., 1:]
+    known = valid.astype(past.dtype)
+    num_past = past.shape[-1]
+    moved, filled = splat(jnp.concatenate([past * known, known], axis=-1), forward_px)
+    share = moved[..., num_past:]
+    carried = filled[..., None] & (share >= 0.5)
+    return _append(jnp.where(carried, moved[..., :num_past] / jnp.maximum(share, 0.5), 0.0), carried, distance_m)
+
+
+def push_gather(
+    motion: MotionMap,
+    backward_px: Float[Array, "height width 2"],
+    distance_m: Float[Array, "height width"],
+    max_step_m: Float[Array, ""],
+) -> MotionMap:
+    """Slide the window by one frame, each pixel fetching its past from where it was.
+
+    Of the four pixels around that place only those whose last distance lies within `max_step_m` of the pixel's own
+    take part: a larger jump is another surface (an occlusion, or flow that crosses an edge), not a motion. Where none
+    is left the pixel's past is unknown. This keeps front and back of a depth edge apart, which bilinear mixing blurs.
+    """
+    past, valid = motion.distance_m[..., 1:], motion.valid[..., 1:]
+    num_past = past.shape[-1]
+    taps, weight = gather_taps(jnp.concatenate([past, valid.astype(past.dtype)], axis=-1), backward_px)
+    values, known = taps[..., :num_past], taps[..., num_past:]
+    same_surface = (jnp.abs(values[..., -1] - distance_m) <= max_step_m) & (known[..., -1] > 0) & (distance_m > 0)
+    weight = jnp.where(same_surface, weight, 0.0)[..., None] * known
+    total = jnp.sum(weight, axis=0)
+    carried = total > 1e-3
+    mixed = jnp.sum(values * weight, axis=0) / jnp.where(carried, total, 1.0)
+    return _append(jnp.where(carried, mixed, 0.0), carried, distance_m)
+
+
+def carry(
+    image: Float[Array, "height width channel"], backward_px: Float[Array, "height width 2"], fill: Float[Array, ""]
+) -> Float[Array, "height width channel"]:
+    """A map of the last frame moved to this one by gathering; `fill` where it comes from outside the picture."""
+    moved, covered = gather(image, backward_px)
+    return jnp.where(covered[..., None], moved, fill)

@@ -1,0 +1,238 @@
+"""From likelihood to mask (TagAttention, III.G): 3D K-means segments, CDF-corner cut, box and centre."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+_FAR = 1e6
+
+
+class Segments(eqx.Module):
+    """Soft K-means segments on a grid of cells: each pixel belongs to the 3 x 3 segments around its own cell.
+
+    `share` sums to 1 over its first axis for valid pixels and to 0 for the others; neighbour n of a pixel in cell
+    (i, j) is the segment (i + n // 3 - 1, j + n % 3 - 1).
+    """
+
+    share: Float[Array, "9 height width"]
+    weight: Float[Array, "rows columns"]  # pixels in each segment
+    cell: int = eqx.field(static=True)
+
+
+def _cell_sum(image: Float[Array, "height width channel"], cell: int) -> Float[Array, "rows columns channel"]:
+    height, width, channels = image.shape
+    rows, columns = -(-height // cell), -(-width // cell)
+    padded = jnp.pad(image, ((0, rows * cell - height), (0, columns * cell - width), (0, 0)))
+    return jnp.sum(padded.reshape(rows, cell, columns, cell, channels), axis=(1, 3))
+
+
+def _spread(
+    grid: Float[Array, "rows columns channel"], cell: int, height: int, width: int
+) -> Float[Array, "height width channel"]:
+    return jnp.repeat(jnp.repeat(grid, cell, axis=0), cell, axis=1)[:height, :width]
+
+
+def _shifted(grid: Float[Array, "rows columns channel"], fill: float) -> list[Float[Array, "rows columns channel"]]:
+    """The grid as seen from each cell's nine neighbours, in the order of `Segments.share`."""
+    rows, columns, _ = grid.shape
+    padded = jnp.pad(grid, ((1, 1), (1, 1), (0, 0)), constant_values=fill)
+    return [padded[dy : dy + rows, dx : dx + columns] for dy in range(3) for dx in range(3)]
+
+
+def _unshift_sum(parts: list[Float[Array, "rows columns channel"]]) -> Float[Array, "rows columns channel"]:
+    """Adjoint of `_shifted`: hand each neighbour its part back."""
+    rows, columns, channels = parts[0].shape
+    total = jnp.zeros((rows + 2, columns + 2, channels))
+    for n, part in enumerate(parts):
+        total = total + jnp.pad(part, ((n // 3, 2 - n // 3), (n % 3, 2 - n % 3), (0, 0)))
+    return total[1:-1, 1:-1]
+
+
+def segment(
+    features: Float[Array, "height width feature"],
+    valid: Bool[Array, "height width"],
+    temperature: Float[Array, ""],
+    *,
+    cell: int,
+    num_iterations: int = 3,
+) -> Segments:
+    """Soft K-means of pixel features (3D position in metres first), seeded by cells of the picture.
+
+    Assignments are softmax(-||f - c||^2 / (2 temperature^2)) over the nine nearest seeds (the local search of SLIC:
+    Achanta et al., 2012), so the cost does not grow with the number of segments; temperature -> 0 is hard K-means
+    (TagAttention, III.G, after Jaimez et al., 2017).
+    """
+    height, width, _ = features.shape
+    known = valid.astype(features.dtype)[..., None]
+    features = jnp.where(valid[..., None], features, 0.0)
+
+    def centres(shares: Float[Array, "9 height width"]) -> Float[Array, "rows columns channel"]:
+        stacked = jnp.concatenate([features, known], axis=-1)
+        summed = _unshift_sum([_cell_sum(stacked * share[..., None], cell) for share in shares])
+        mass = summed[..., -1:]
+        return jnp.concatenate([summed[..., :-1] / jnp.maximum(mass, 1e-6), mass], axis=-1)
+
+    own = jnp.zeros((9, height, width)).at[4].set(known[..., 0])
+    seeds = centres(own)
+
+    def assign(seeds: Float[Array, "rows columns channel"]) -> Float[Array, "9 height width"]:
+        scores = []
+        for near in _shifted(seeds, 0.0):
+            spread = _spread(near, cell, height, width)
+            squared = jnp.sum(jnp.square(features - spread[..., :-1]), axis=-1)
+            scores.append(jnp.where(spread[..., -1] > 0.5, -squared / (2.0 * temperature**2), -_FAR))
+        return jax.nn.softmax(jnp.stack(scores), axis=0) * known[None, ..., 0]
+
+    def iterate(seeds: Float[Array, "rows columns channel"], _: None):
+        return centres(assign(seeds)), None
+
+    seeds, _ = jax.lax.scan(iterate, seeds, None, length=num_iterations)
+    return Segments(share=assign(seeds), weight=seeds[..., -1], cell=cell)
+
+
+def pool(
+    segments: Segments, values: Float[Array, "height width channel"], weight: Float[Array, "height width"]
+) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
+    """Weighted mean of pixel values over each segment, and the weight that stands behind it (0 where none)."""
+    stacked = jnp.concatenate([values * weight[..., None], weight[..., None]], axis=-1)
+    summed = _unshift_sum([_cell_sum(stacked * share[..., None], segments.cell) for share in segments.share])
+    mass = summed[..., -1]
+    mean = summed[..., :-1] / jnp.where(mass > 1e-6, mass, 1.0)[..., None]
+    return jnp.where(mass[..., None] > 1e-6, mean, 0.0), mass
+
+
+def unpool(segments: Segments, grid: Float[Array, "rows columns channel"]) -> Float[Array, "height width channel"]:
+    """Segment values handed back to the pixels by their shares."""
+    _, height, width = segments.share.shape
+    spread = [
+        _spread(near, segments.cell, height, width) * share[..., None]
+        for near, share in zip(_shifted(grid, 0.0), segments.share, strict=True)
+    ]
+    return sum(spread, start=jnp.zeros((height, width, grid.shape[-1])))
+
+
+def diffuse(
+    values: Float[Array, "rows columns"],
+    affinity: Float[Array, "9 rows columns"],
+    rate: Float[Array, ""],
+    *,
+    num_iterations: int = 4,
+) -> Float[Array, "rows columns"]:
+    """Let segments that belong together share their log odds: x <- (1 - rate) values + rate (affinity x), repeated.
+
+    `affinity` sums to at most 1 over its first axis. rate = 0 leaves the values alone. A limb that swings against the
+    body for a moment is held by the body.
+    """
+
+    def spread(x: Float[Array, "rows columns"], _: None):
+        near = jnp.stack([part[..., 0] for part in _shifted(x[..., None], 0.0)])
+        return (1.0 - rate) * values + rate * jnp.sum(near * affinity, axis=0), None
+
+    out, _ = jax.lax.scan(spread, values, None, length=num_iterations)
+    return out
+
+
+def segment_affinity(
+    segments: Segments,
+    centre_m: Float[Array, "rows columns 3"],
+    step_m: Float[Array, "rows columns"],
+    length_m: Float[Array, ""],
+    step_scale_m: Float[Array, ""],
+) -> Float[Array, "9 rows columns"]:
+    """How much each segment and its eight neighbours are one thing: near in 3D and moving alike; sums to 1."""
+    alive = segments.weight > 1.0
+    near = jnp.stack(
+        _shifted(jnp.concatenate([centre_m, step_m[..., None], alive.astype(step_m.dtype)[..., None]], axis=-1), 0.0)
+    )
+    apart = jnp.sum(jnp.square(near[..., :3] - centre_m), axis=-1) / (2.0 * length_m**2)
+    unlike = jnp.square(near[..., 3] - step_m) / (2.0 * step_scale_m**2)
+    raw = jnp.where((near[..., 4] > 0.5) & alive, jnp.exp(-apart - unlike), 0.0)
+    return raw / jnp.maximum(jnp.sum(raw, axis=0), 1e-6)
+
+
+def min_max(value: Float[Array, "height width"], valid: Bool[Array, "height width"]) -> Float[Array, "height width"]:
+    """Min-max normalisation to [0, 1] over valid pixels (III.G); 0 elsewhere, and everywhere if nothing varies."""
+    low = jnp.min(jnp.where(valid, value, jnp.inf))
+    high = jnp.max(jnp.where(valid, value, -jnp.inf))
+    varies = high > low
+    span = jnp.where(varies, high - low, 1.0)
+    return jnp.where(valid & varies, (value - jnp.where(varies, low, 0.0)) / span, 0.0)
+
+
+def cdf_corner(
+    probability: Float[Array, "height width"],
+    valid: Bool[Array, "height width"],
+    significance: Float[Array, ""],
+    width: Float[Array, ""],
+    *,
+    num_bins: int = 64,
+) -> Float[Array, ""]:
+    """The last corner of the CDF of normalised probabilities (III.G, Fig. 6): where to cut the object out.
+
+    A corner is a bin at which the slope of the CDF rises by more than `significance` (a share of the pixels); pixels
+    are binned linearly, so the corner moves smoothly with them. The last corner is taken softly,
+    w_i = s_i prod_{j > i} (1 - s_j) with s = sigmoid((rise - significance) / width), which is hard as width -> 0.
+    Without any corner the cut is 0.5.
+    """
+    position = jnp.clip(probability, 0.0, 1.0) * (num_bins - 1)
+    lower = jnp.clip(jnp.floor(position), 0, num_bins - 2)
+    share = position - lower
+    known = valid.astype(probability.dtype)
+    index = lower.astype(jnp.int32).reshape(-1)
+    histogram = (
+        jnp.zeros(num_bins)
+        .at[index]
+        .add(((1.0 - share) * known).reshape(-1))
+        .at[index + 1]
+        .add((share * known).reshape(-1))
+    ) / jnp.maximum(jnp.sum(known), 1.0)
+    rise = histogram[1:] - histogram[:-1]
+    score = jax.nn.sigmoid((rise - significance) / width)
+    later = jnp.flip(jnp.cumprod(jnp.flip(1.0 - score)))
+    weight = score * jnp.concatenate([later[1:], jnp.ones(1)])
+    edges = (jnp.arange(num_bins - 1) + 0.5) / (num_bins - 1)
+    return jnp.sum(weight * edges) + (1.0 - jnp.sum(weight)) * 0.5
+
+
+def mean_shift(
+    points_m: Float[Array, "height width 3"],
+    weight: Float[Array, "height width"],
+    start_m: Float[Array, " 3"],
+    bandwidth_m: Float[Array, ""],
+    *,
+    num_iterations: int = 5,
+) -> Float[Array, " 3"]:
+    """The mode of weighted points next to `start_m`: Gaussian mean shift; the start where no weight is near."""
+
+    def shift(centre: Float[Array, " 3"], _: None):
+        kernel = weight * jnp.exp(-jnp.sum(jnp.square(points_m - centre), axis=-1) / (2.0 * bandwidth_m**2))
+        total = jnp.sum(kernel)
+        mean = jnp.sum(points_m * kernel[..., None], axis=(0, 1)) / jnp.maximum(total, 1e-6)
+        return jnp.where(total > 1e-6, mean, centre), None
+
+    centre, _ = jax.lax.scan(shift, start_m, None, length=num_iterations)
+    return centre
+
+
+def bounding_box(mask: Float[Array, "height width"], tail: float) -> Float[Array, " 4"]:
+    """Box x0 y0 x1 y1 (pixel edges) that leaves at most the share `tail` of the mask outside on each side.
+
+    tail = 0 is the exact bounding box of a binary mask; a small tail keeps a stray pixel from stretching it. An empty
+    mask gives an empty box at the origin.
+    """
+
+    def span(profile: Float[Array, " size"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        total = jnp.sum(profile)
+        below = jnp.cumsum(profile)
+        above = jnp.flip(jnp.cumsum(jnp.flip(profile)))
+        first = jnp.sum(below <= tail * total + 1e-6 * total)
+        last = profile.shape[0] - jnp.sum(above <= tail * total + 1e-6 * total)
+        some = total > 0
+        return jnp.where(some, first, 0).astype(mask.dtype), jnp.where(some, last, 0).astype(mask.dtype)
+
+    x0, x1 = span(jnp.sum(mask, axis=0))
+    y0, y1 = span(jnp.sum(mask, axis=1))
+    return jnp.stack([x0, y0, x1, y1]) - 0.5 * (x1 > x0).astype(mask.dtype)
