@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -50,15 +51,15 @@ class AbstractTracer(eqx.Module):
     """A tracing system as a state machine of fixed shapes: `init`, one `step` a frame, `finish`."""
 
     @abc.abstractmethod
-    def init(self, camera: Camera, frame: Frame) -> eqx.AbstractVar | object:
+    def init(self, camera: Camera, frame: Frame) -> Any:
         """The state before the first frame; `frame` (no time axis) tells shapes only."""
 
     @abc.abstractmethod
-    def step(self, camera: Camera, state, frame: Frame):
+    def step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
         """The next state, and the `Trace` of this frame."""
 
     @abc.abstractmethod
-    def finish(self, state):
+    def finish(self, state: Any) -> Any:
         """The state handed on to whoever continues the recording: nothing in it refers to a past frame's buffer."""
 
 
