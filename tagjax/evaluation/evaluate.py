@@ -1,0 +1,264 @@
+"""Run a tracer over whole recordings and score what it says against their truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from ..recording import Recording, RecordingError
+from ..tracer import AbstractTracer, Camera, Frame, Trace
+from . import metrics
+from .metrics import FrameScores, Scores
+
+
+@dataclasses.dataclass(frozen=True)
+class ScoreSettings:
+    """What counts, and how much is traced at once."""
+
+    moved_for_s: float = 1.5  # score a tag once it has moved for this long
+    min_speed_m_s: float = 0.1  # slower than this is no motion
+    threshold: float = 0.5  # IoU of a lock and of a success
+    lock_frames: int = 5
+    min_pixels: int = 100  # an object that shows less is not scored
+    mask_level: float = 0.5  # soft masks are cut here
+    tags_at_once: int = 6
+    frames_at_once: int = 48
+    num_pictures: int = 12  # frames kept for overlay pictures, spread over the recording
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """What a tracer said at one frame, at the full picture's size, kept to be drawn."""
+
+    frame: int
+    epcs: tuple[str, ...]
+    masks: Bool[np.ndarray, "tag height width"]
+    boxes_px: Float[np.ndarray, "tag 4"]
+    confidence: Float[np.ndarray, " tag"]
+    found: Bool[np.ndarray, " tag"]
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordingResult:
+    """Scores of every tag of one recording (none without truth), and the pictures kept."""
+
+    recording: Recording
+    frames: dict[str, FrameScores]
+    pictures: list[Picture]
+    settings: ScoreSettings
+
+    def tag_scores(self) -> dict[str, Scores]:
+        """The scores of each tag by itself."""
+        chosen = self.settings
+        return {
+            epc: Scores.of(frames, threshold=chosen.threshold, lock_frames=chosen.lock_frames)
+            for epc, frames in self.frames.items()
+        }
+
+    def scores(self) -> Scores:
+        """All tags together, each frame counting the same."""
+        total = Scores()
+        for scores in self.tag_scores().values():
+            total = total.merge(scores)
+        return total
+
+
+def box_to_picture(
+    box_px: Shaped[np.ndarray, "*batch 4"], stride: int, height: int, width: int
+) -> Float[np.ndarray, "*batch 4"]:
+    """Inclusive box edges at every `stride`-th pixel to those of the full picture.
+
+    Working pixel i is the full picture's pixel i * stride and stands for the `stride` pixels around it.
+    """
+    reach = 0.5 * (stride - 1)
+    box = np.asarray(box_px, np.float64) * stride + np.array([-reach, -reach, reach, reach])
+    return np.clip(box, 0.0, np.array([width - 1, height - 1, width - 1, height - 1], dtype=np.float64))
+
+
+def mask_to_picture(
+    mask: Shaped[np.ndarray, "rows columns"], stride: int, height: int, width: int
+) -> Float[np.ndarray, "height width"]:
+    """Soft mask at every `stride`-th pixel, interpolated linearly to the full picture."""
+    soft = np.asarray(mask, np.float32)
+    if stride == 1:
+        return soft
+    scale = np.array([[stride, 0, 0], [0, stride, 0]], dtype=np.float64)
+    return cv2.warpAffine(soft, scale, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@eqx.filter_jit
+def _init(tracer: AbstractTracer, camera: Camera, frame: Frame) -> Any:
+    return tracer.init(camera, frame)
+
+
+@eqx.filter_jit
+def _step(tracer: AbstractTracer, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
+    return tracer.step(camera, state, frame)
+
+
+def _tags(frame: Frame, chosen: np.ndarray) -> Frame:
+    """One frame (leading time axis kept) with only the chosen tags."""
+    pick = lambda leaf: leaf[:, chosen]  # noqa: E731
+    return eqx.tree_at(
+        lambda f: (f.radio, f.reads), frame, (jax.tree.map(pick, frame.radio), jax.tree.map(pick, frame.reads))
+    )
+
+
+def trace_recording(
+    tracer: AbstractTracer,
+    recording: Recording,
+    load: Callable[..., Any],
+    *,
+    epcs: Sequence[str],
+    settings: ScoreSettings | None = None,
+    frames: tuple[int, int] | None = None,
+) -> Iterator[tuple[int, Trace]]:
+    """Every frame's number and `Trace` (NumPy leaves, tag axis in the order of `epcs`), frame by frame.
+
+    `load(recording, start, stop, epcs=...)` gives a `Clip`. Pieces of `frames_at_once` frames are read one after the
+    other with the tracer's state carried across, so that memory does not grow with the recording; tags go through in
+    groups of `tags_at_once`, the last one filled up by repetition, so that one compilation does for all.
+    """
+    settings = settings or ScoreSettings()
+    first, last = frames or (0, recording.num_frames)
+    if not 0 <= first < last <= recording.num_frames:
+        raise RecordingError(
+            f"{recording.name}: frames {first} to {last} asked for; expected a part of 0 to {recording.num_frames}."
+        )
+    if not epcs:
+        raise RecordingError(f"{recording.name}: no tag to trace. The recording holds no read, or epcs is empty.")
+    size = min(settings.tags_at_once, len(epcs))
+    groups = [np.arange(start, start + size).clip(max=len(epcs) - 1) for start in range(0, len(epcs), size)]
+    states: list[Any] = [None] * len(groups)
+    for start in range(first, last, settings.frames_at_once):
+        stop = min(start + settings.frames_at_once, last)
+        overlap = int(start > first)  # a clip's first frame has no flow: read it again, with the frame before
+        clip = load(recording, start - overlap, stop, epcs=list(epcs))
+        parts = [_tags(clip.frames, group) for group in groups]
+        for index in range(overlap, stop - start + overlap):
+            said = []
+            for number, part in enumerate(parts):
+                frame = jax.tree.map(lambda leaf, i=index: jnp.asarray(leaf[i]), part)
+                if states[number] is None:
+                    states[number] = _init(tracer, clip.camera, frame)
+                states[number], out = _step(tracer, clip.camera, states[number], frame)
+                said.append(jax.tree.map(np.asarray, out))
+            together = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(epcs)], *said)
+            yield start - overlap + index, together
+
+
+def evaluate_recording(
+    tracer: AbstractTracer,
+    recording: Recording,
+    load: Callable[..., Any],
+    *,
+    stride: int,
+    epcs: Sequence[str] | None = None,
+    settings: ScoreSettings | None = None,
+    frames: tuple[int, int] | None = None,
+    on_frame: Callable[[], None] | None = None,
+) -> RecordingResult:
+    """Trace a recording and score every tag whose object the truth labels; without truth only pictures come back.
+
+    Boxes and masks are compared at the full picture's size. `stride` is the one `load` works with; `on_frame` is
+    called after each frame.
+    """
+    settings = settings or ScoreSettings()
+    names = recording.resolve_epcs(epcs)
+    first, last = frames or (0, recording.num_frames)
+    height, width = recording.image_shape
+    truth = recording.truth
+    scored = {epc: truth.tag_to_label[epc] for epc in names if truth is not None and epc in truth.tag_to_label}
+    if truth is None or truth.labels is None:
+        scored = {}
+    kept = set(np.linspace(first, last - 1, settings.num_pictures).astype(int).tolist())
+    rows: dict[str, list[tuple[Any, ...]]] = {epc: [] for epc in scored}
+    pictures: list[Picture] = []
+    for number, said in trace_recording(tracer, recording, load, epcs=names, settings=settings, frames=(first, last)):
+        boxes = box_to_picture(np.asarray(said.box_px), stride, height, width)
+        masks = {
+            tag: mask_to_picture(np.asarray(said.mask[tag]), stride, height, width) >= settings.mask_level
+            for tag, epc in enumerate(names)
+            if epc in scored or number in kept
+        }
+        labels = np.asarray(truth.labels[number]) if truth is not None and truth.labels is not None else None
+        if labels is not None:
+            for tag, epc in enumerate(names):
+                if epc in scored:
+                    rows[epc].append(
+                        (
+                            *_score_frame(masks[tag], boxes[tag], labels, scored[epc], settings),
+                            float(said.confidence[tag]),
+                            bool(said.found[tag]),
+                        )
+                    )
+        if number in kept:
+            pictures.append(
+                Picture(
+                    number,
+                    tuple(names),
+                    np.stack([masks[tag] for tag in range(len(names))]),
+                    boxes,
+                    np.asarray(said.confidence, np.float64),
+                    np.asarray(said.found, bool),
+                )
+            )
+        if on_frame is not None:
+            on_frame()
+    results = {epc: _tag_frames(recording, epc, scored[epc], rows[epc], (first, last), settings) for epc in scored}
+    return RecordingResult(recording, results, pictures, settings)
+
+
+def _score_frame(
+    mask: np.ndarray, box_px: np.ndarray, labels: np.ndarray, label: int, settings: ScoreSettings
+) -> tuple[float, float, float, int, bool]:
+    height, width = labels.shape
+    true_box = metrics.label_box(labels, label)
+    shows = int(np.sum(labels == label)) >= settings.min_pixels
+    whole = shows and not bool(metrics.touches_border(true_box, height, width))
+    return (
+        float(metrics.box_iou(box_px, true_box)),
+        float(metrics.centre_error(box_px, true_box, width)),
+        metrics.mask_iou(mask, labels, label),
+        metrics.most_covered(mask, labels, min_pixels=settings.min_pixels),
+        whole,
+    )
+
+
+def _tag_frames(
+    recording: Recording,
+    epc: str,
+    label: int,
+    rows: list[tuple[Any, ...]],
+    frames: tuple[int, int],
+    settings: ScoreSettings,
+) -> FrameScores:
+    truth = recording.truth
+    if truth is None:
+        raise RecordingError(f"{recording.name}: no truth to score {epc} with.")
+    part = slice(*frames)
+    time_s = recording.frame_time_s()
+    iou, cle_px, mask_j, identified, shown, confidence, found = (np.array(column) for column in zip(*rows, strict=True))
+    if label in truth.visible:
+        shown = shown & np.asarray(truth.visible[label], bool)[part]
+    moved = metrics.moved_for(truth, epc, time_s, settings.moved_for_s, min_speed_m_s=settings.min_speed_m_s)
+    return FrameScores(
+        time_s=time_s[part],
+        iou=iou.astype(np.float64),
+        cle_px=cle_px.astype(np.float64),
+        mask_j=mask_j.astype(np.float64),
+        identified=identified.astype(np.int64),
+        confidence=confidence.astype(np.float64),
+        found=found.astype(bool),
+        shown=shown.astype(bool),
+        moved=moved[part],
+        label=label,
+    )

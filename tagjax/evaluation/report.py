@@ -1,0 +1,172 @@
+"""The report of an evaluation: metrics.json, frames.csv, overlay pictures and curves in one folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from ..viz.overlay import draw_overlay, short_name
+from .evaluate import RecordingResult
+from .metrics import Scores, label_box
+
+Results = Mapping[str, Sequence[RecordingResult]]
+"""Results of each tracer, by name, one element a recording; the recordings are the same for all."""
+
+_COLUMNS = ("iou", "cle_px", "mask_j", "identified", "confidence", "found", "shown", "moved")
+
+
+def summarise(results: Results) -> dict[str, Any]:
+    """Plain JSON: for each tracer the scores of all, of each recording and of each tag."""
+    summary: dict[str, Any] = {}
+    for tracer, ones in results.items():
+        total = Scores()
+        recordings: dict[str, Any] = {}
+        for number, one in enumerate(ones):
+            total = total.merge(one.scores())
+            tags = {epc: scores.result() for epc, scores in one.tag_scores().items()}
+            recordings[_recording_name(ones, number)] = {"all": one.scores().result(), "tags": tags}
+        summary[tracer] = {"all": total.result(), "recordings": recordings}
+    return summary
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON beside and rename, so that a reader never sees half a file. NaN and infinity become null."""
+    beside = path.with_name(path.name + ".part")
+    beside.write_text(json.dumps(plain(content), indent=2) + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+def plain(content: Any) -> Any:
+    """Numbers, strings, lists and dictionaries only; what is not finite becomes None."""
+    if isinstance(content, Mapping):
+        return {str(key): plain(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [plain(value) for value in content]
+    if isinstance(content, np.ndarray):
+        return plain(content.tolist())
+    if isinstance(content, np.generic):
+        return plain(content.item())
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content
+
+
+def write_report(folder: Path, results: Results) -> dict[str, Any]:
+    """Write the whole report and return its summary."""
+    folder.mkdir(parents=True, exist_ok=True)
+    summary = summarise(results)
+    write_json(folder / "metrics.json", summary)
+    write_frames(folder / "frames.csv", results)
+    for tracer, ones in results.items():
+        for number, one in enumerate(ones):
+            write_overlays(folder / "overlays" / _recording_name(ones, number) / tracer, one)
+    write_curves(folder / "curves", results)
+    return summary
+
+
+def write_frames(path: Path, results: Results) -> None:
+    """One CSV row a tracer, recording, tag and frame."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(("tracer", "recording", "epc", "label", "frame", "time_s", *_COLUMNS))
+        for tracer, ones in results.items():
+            for number, one in enumerate(ones):
+                for epc, frames in one.frames.items():
+                    offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
+                    for index, time_s in enumerate(frames.time_s):
+                        values = [getattr(frames, column)[index] for column in _COLUMNS]
+                        written = [int(v) if isinstance(v, np.bool_ | np.integer) else f"{v:.6g}" for v in values]
+                        head = (
+                            tracer,
+                            _recording_name(ones, number),
+                            epc,
+                            frames.label,
+                            offset + index,
+                            f"{time_s:.4f}",
+                        )
+                        rows.writerow((*head, *written))
+
+
+def write_overlays(folder: Path, result: RecordingResult) -> None:
+    """One PNG a kept frame, true boxes thin and white."""
+    folder.mkdir(parents=True, exist_ok=True)
+    truth = result.recording.truth
+    for picture in result.pictures:
+        true_boxes = np.full((len(picture.epcs), 4), np.nan)
+        if truth is not None and truth.labels is not None:
+            labels = np.asarray(truth.labels[picture.frame])
+            for tag, epc in enumerate(picture.epcs):
+                if epc in truth.tag_to_label:
+                    true_boxes[tag] = label_box(labels, truth.tag_to_label[epc])
+        drawn = draw_overlay(
+            np.asarray(result.recording.colour[picture.frame]),
+            [short_name(epc) for epc in picture.epcs],
+            picture.masks,
+            picture.boxes_px,
+            picture.confidence,
+            picture.found,
+            true_boxes_px=true_boxes,
+            caption=f"frame {picture.frame}",
+        )
+        cv2.imwrite(str(folder / f"frame{picture.frame:06d}.png"), np.ascontiguousarray(drawn[..., ::-1]))
+
+
+def write_curves(folder: Path, results: Results) -> None:
+    """One PNG a tag: IoU and CLE against frame number, all tracers together."""
+    try:
+        from ..viz.curves import score_curves
+    except ImportError:
+        warnings.warn("No curves: matplotlib is missing (it comes with the viz extra).", stacklevel=2)
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    reference = next(iter(results.values()), ())
+    for number, one in enumerate(reference):
+        for epc, frames in one.frames.items():
+            lines = {}
+            for tracer, ones in results.items():
+                own = ones[number].frames[epc]
+                lines[tracer] = {
+                    "iou": np.where(own.found, own.iou, 0.0),
+                    "cle_px": np.where(own.found & own.shown, own.cle_px, np.nan),
+                }
+            name = _recording_name(reference, number)
+            offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
+            score_curves(folder / f"{name}_{epc}.png", lines, frames.valid, first_frame=offset, title=f"{name}: {epc}")
+
+
+def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
+    """The scores over all tags, one row a tracer."""
+    columns = {
+        "iou": "IoU",
+        "cle_px": "CLE px",
+        "mask_j": "mask J",
+        "identification": "identified",
+        "found": "found",
+        "locked": "locked",
+        "time_to_lock_s": "lock s",
+        "num_frames": "frames",
+    }
+    table = Table(title=title)
+    table.add_column("tracer")
+    for heading in columns.values():
+        table.add_column(heading, justify="right")
+    for tracer, scores in summary.items():
+        values = [scores["all"].get(name) for name in columns]
+        table.add_row(tracer, *("-" if v is None else f"{v:d}" if isinstance(v, int) else f"{v:.3g}" for v in values))
+    return table
+
+
+def _recording_name(results: Sequence[RecordingResult], number: int) -> str:
+    """The recording's own name, numbered where several share it."""
+    names = [one.recording.name for one in results]
+    return names[number] if names.count(names[number]) == 1 else f"{names[number]}-{number}"

@@ -1,0 +1,156 @@
+"""Checkpoints: everything a run needs to go on exactly where it stopped, written atomically by Orbax.
+
+A checkpoint holds the arrays of the `TrainState` (never code or pickles), the state of the data iterator and a
+description of the arrays, which is compared before anything is restored.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from jaxtyping import PyTree
+
+from .state import TrainState
+
+FORMAT = "tagjax training checkpoint 1"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used: what was found, what was expected, what to do."""
+
+
+def describe_arrays(tree: PyTree) -> dict[str, str]:
+    """Path, dtype and shape of every array leaf."""
+    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))[0]
+    return {jax.tree_util.keystr(path): f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in leaves}
+
+
+class Checkpoints:
+    """The checkpoints of one run, in one folder; the newest few and every `keep_every`-th are kept."""
+
+    def __init__(self, folder: Path | str, *, keep: int = 3, keep_every: int | None = None, create: bool = True):
+        """Raises `CheckpointError` if the folder is missing and is not to be created."""
+        self.folder = Path(folder).absolute()
+        if not create and not self.folder.is_dir():
+            raise CheckpointError(
+                f"No checkpoints at {self.folder}: no such folder. Name a run folder written by experiments.train."
+            )
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep, keep_period=keep_every, create=create, enable_async_checkpointing=False
+        )
+        self._manager = ocp.CheckpointManager(self.folder, options=options)
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._manager.close()
+
+    def steps(self) -> list[int]:
+        """Steps at which a finished checkpoint exists, ascending."""
+        return sorted(self._manager.all_steps())
+
+    def save(self, state: TrainState, data_state: Any) -> None:
+        """Write a checkpoint of the state at its step; `data_state` is plain JSON (the iterator's own state)."""
+        step = int(state.step)
+        if step in self.steps():
+            return
+        # Flat and named by number: Orbax then needs no knowledge of our classes, and nothing is pickled.
+        arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
+        about = {"format": FORMAT, "step": step, "arrays": describe_arrays(state), "data": _jsonable(data_state)}
+        self._manager.save(
+            step,
+            args=ocp.args.Composite(
+                arrays=ocp.args.StandardSave({f"{n:04d}": leaf for n, leaf in enumerate(arrays)}),
+                about=ocp.args.JsonSave(about),
+            ),
+        )
+        self._manager.wait_until_finished()
+
+    def restore(self, like: TrainState, step: int | None = None) -> tuple[TrainState, Any]:
+        """The state at `step` (the newest if None) and the data iterator's state.
+
+        `like` is a fresh state of the same configuration: it gives the structure, the checkpoint the arrays. A folder
+        without checkpoint, a foreign or damaged one, or one of another tracer raises `CheckpointError`.
+        """
+        steps = self.steps()
+        if not steps:
+            inside = ", ".join(sorted(path.name for path in self.folder.iterdir())[:6]) or "nothing"
+            raise CheckpointError(
+                f"No finished checkpoint at {self.folder} (it holds {inside}). Name a run folder written by "
+                "experiments.train that has done at least one step."
+            )
+        step = steps[-1] if step is None else step
+        if step not in steps:
+            raise CheckpointError(f"No checkpoint of step {step} at {self.folder}; there are {steps}.")
+        about = self._about(step)
+        _compare(about["arrays"], describe_arrays(like), self.folder / str(step))
+        arrays, rest = eqx.partition(like, eqx.is_array)
+        leaves, structure = jax.tree.flatten(arrays)
+        wanted = {
+            f"{n:04d}": jax.ShapeDtypeStruct(
+                leaf.shape, leaf.dtype, sharding=jax.sharding.SingleDeviceSharding(jax.devices()[0])
+            )
+            for n, leaf in enumerate(leaves)
+        }
+        try:
+            found = self._manager.restore(step, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(wanted)))[
+                "arrays"
+            ]
+        except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
+            raise CheckpointError(
+                f"The checkpoint {self.folder / str(step)} is damaged: its arrays cannot be read "
+                f"({type(error).__name__}). Delete that folder to go on from an older one; there are {steps}."
+            ) from error
+        state = eqx.combine(jax.tree.unflatten(structure, [found[f"{n:04d}"] for n in range(len(leaves))]), rest)
+        return state, about["data"]
+
+    def _about(self, step: int) -> dict[str, Any]:
+        path = self.folder / str(step)
+        try:
+            about = self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
+        except Exception as error:
+            inside = ", ".join(sorted(item.name for item in path.iterdir())[:6]) or "nothing"
+            raise CheckpointError(
+                f"{path} is no checkpoint of tagjax, or a damaged one: it holds {inside}; expected a readable "
+                f"description in 'about' ({type(error).__name__})."
+            ) from error
+        if not isinstance(about, dict) or about.get("format") != FORMAT:
+            found = about.get("format") if isinstance(about, dict) else type(about).__name__
+            raise CheckpointError(
+                f"{path} has format {found!r}; expected {FORMAT!r}. Another program or version wrote it."
+            )
+        return about
+
+
+def _compare(found: dict[str, str], expected: dict[str, str], path: Path) -> None:
+    differences = [
+        f"{name}: found {found.get(name, 'nothing')}, expected {expected.get(name, 'nothing')}"
+        for name in sorted({*found, *expected})
+        if found.get(name) != expected.get(name)
+    ]
+    if differences:
+        listed = "; ".join(differences[:5]) + (f"; and {len(differences) - 5} more" if len(differences) > 5 else "")
+        raise CheckpointError(
+            f"The checkpoint {path} belongs to another tracer or optimiser. {listed}. Use the configuration of its run."
+        )
+
+
+def _jsonable(data_state: Any) -> Any:
+    try:
+        json.dumps(data_state)
+    except TypeError as error:
+        raise CheckpointError(f"The data iterator's state is no plain JSON ({error}); it cannot be kept.") from error
+    return data_state

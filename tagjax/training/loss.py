@@ -1,0 +1,280 @@
+"""Label-free objective: where the mask goes must explain what the tag's reads say, and nobody else's.
+
+The soft mask's distance over time, linear between frames, is held against raw phases by their coherence: nothing is
+unwrapped, and no label is used. Each term is a function of a `Seen` clip; `TERMS` names them, settings weigh them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._numerics import safe_divide, safe_norm
+from ..rf.coherence import coherence, phase_residual
+from ..rf.reads import PhaseReads
+from ..tracer import AbstractTracer, Camera, Frame, Trace, trace
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectiveSettings:
+    """Weights of the terms and what they look at. Terms of weight 0 are not computed."""
+
+    contrast: float = 1.0
+    coverage: float = 0.3
+    temperature: float = 0.1  # of the contrast, in units of coherence
+    num_shifts: int = 4  # time-shifted copies of the own motion among the negatives
+    span_frames: int = 10  # coherence is taken over pieces this long: drift of the sum does not reach further
+    skip_frames: int = 5  # at the start of a clip, while the tracer has not seen a full window
+    min_reads: int = 6  # a piece with fewer reads says nothing
+    max_reads: int = 384  # reads of one tag in a clip
+    num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
+    multiple: int = 2  # 2 takes phases modulo pi: right whether the reader flips or not
+    future_alpha_m2: float = 1e-3  # a pixel agrees with the future if it is within about the root of this
+    future_stride: int = 2  # every n-th working pixel is asked
+    rematerialise: bool = True  # keep only the tracer's states for the backward pass
+
+    def weights(self) -> dict[str, float]:
+        """The weight of each term that takes part, by name."""
+        weights = {name: float(getattr(self, name)) for name in TERMS}
+        taking_part = {name: weight for name, weight in weights.items() if weight != 0.0}
+        if not taking_part:
+            raise ValueError(f"All terms of the objective have weight 0; give one of {', '.join(TERMS)} a weight.")
+        return taking_part
+
+
+class Seen(eqx.Module):
+    """A clip with what the tracer made of it."""
+
+    camera: Camera
+    frames: Frame
+    said: Trace
+    reads: PhaseReads  # (tag, reads): each read of the clip once
+
+
+class _Rematerialised(AbstractTracer):
+    """A tracer whose step is computed again in the backward pass instead of being kept."""
+
+    tracer: AbstractTracer
+
+    def init(self, camera: Camera, frame: Frame) -> Any:
+        return self.tracer.init(camera, frame)
+
+    def step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
+        return eqx.filter_checkpoint(lambda t, c, s, f: t.step(c, s, f))(self.tracer, camera, state, frame)
+
+    def finish(self, state: Any) -> Any:
+        return self.tracer.finish(state)
+
+
+def see(tracer: AbstractTracer, camera: Camera, frames: Frame, settings: ObjectiveSettings) -> Seen:
+    """Run the tracer over a clip (leading time axis)."""
+    wrapped = _Rematerialised(tracer) if settings.rematerialise else tracer
+    return Seen(camera, frames, trace(wrapped, camera, frames), clip_reads(frames, settings))
+
+
+def clip_reads(frames: Frame, settings: ObjectiveSettings) -> PhaseReads:
+    """Each tag's reads of the whole clip, (tag, reads), from the overlapping windows of its frames.
+
+    Of a frame's window only what came after the frame before is new. Channels are numbered anew by first appearance
+    and cut at `num_channels`; of more than `max_reads` reads the newest stay.
+    """
+    before = jnp.concatenate([frames.time_s[:1], frames.time_s[:-1]])
+    reads = frames.reads
+    new = reads.valid & (reads.time_s > before[:, None, None]) & (reads.time_s <= frames.time_s[:, None, None])
+    reads = eqx.tree_at(lambda r: r.valid, reads, new)
+
+    def pack(one: PhaseReads) -> PhaseReads:
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1), one)
+        order = jnp.argsort(flat.valid, stable=True)[-settings.max_reads :]
+        packed = jax.tree.map(lambda leaf: leaf[order], flat)
+        number = _number_channels(packed.channel, packed.valid)
+        keep = packed.valid & (number < settings.num_channels)
+        return eqx.tree_at(lambda r: (r.channel, r.valid), packed, (jnp.where(keep, number, 0), keep))
+
+    return jax.vmap(pack)(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), reads))
+
+
+def _number_channels(channel: Int[Array, " reads"], valid: Bool[Array, " reads"]) -> Int[Array, " reads"]:
+    """Channels renumbered 0, 1, 2, ... in order of first appearance among the valid reads."""
+    first = jnp.argmax((channel[:, None] == channel[None, :]) & valid[None, :], axis=1)
+    leads = valid & (first == jnp.arange(channel.shape[0], dtype=first.dtype))
+    return (jnp.cumsum(leads.astype(jnp.int32)) - 1)[first]
+
+
+def distance_at(
+    step_m: Float[Array, " time"], frame_time_s: Float[Array, " time"], query_s: Float[Array, " reads"]
+) -> Float[Array, " reads"]:
+    """Distance relative to the first frame at any time: steps summed up, linear between frames, metres."""
+    distance = jnp.cumsum(step_m.at[0].set(0.0))
+    return jnp.interp(query_s, frame_time_s, distance)
+
+
+def _pieces(seen: Seen, settings: ObjectiveSettings) -> Bool[Array, "piece tag reads"]:
+    """Which reads belong to which piece of the clip; pieces overlap by half."""
+    num_frames = seen.frames.time_s.shape[0]
+    span = min(settings.span_frames, num_frames - 1)
+    skip = min(settings.skip_frames, num_frames - 1 - span)
+    starts = jnp.arange(skip, num_frames - span, max(span // 2, 1))
+    begin, end = seen.frames.time_s[starts], seen.frames.time_s[starts + span]
+    time_s = seen.reads.time_s[None]
+    inside = (time_s > begin[:, None, None]) & (time_s <= end[:, None, None]) & seen.reads.valid[None]
+    enough = jnp.sum(inside, axis=-1, keepdims=True) >= settings.min_reads
+    return inside & enough
+
+
+class Agreement(eqx.Module):
+    """Coherence of each tag's reads with candidate motions, per piece of the clip."""
+
+    between: Float[Array, "reads_of motion_of piece"]  # reads of one tag with the motion of another's mask
+    altered: Float[Array, "tag candidate piece"]  # own reads with altered own motion
+    still: Float[Array, "tag piece"]  # own reads with no motion at all
+    weight: Float[Array, "tag piece"]  # how much the piece can tell: 0 for a tag that rests or is not read
+
+
+def agreement(seen: Seen, settings: ObjectiveSettings, key: Array) -> Agreement:
+    """Hold every tag's reads against its own mask's motion, the other masks', time-shifted and mirrored ones."""
+    time_s, reads = seen.frames.time_s, seen.reads
+    steps = seen.said.step_m.T
+    num_tags, num_frames = steps.shape
+    inside = jnp.moveaxis(_pieces(seen, settings), 0, 1)
+
+    def score(one: PhaseReads, member: Bool[Array, "piece reads"], step_m: Float[Array, " time"]) -> Array:
+        residual = phase_residual(one.phase_rad, one.carrier_hz, distance_at(step_m, time_s, one.time_s))
+        weight = member / (jnp.square(one.sigma_rad) + 0.1)
+        return coherence(
+            jnp.broadcast_to(residual, weight.shape),
+            weight,
+            jnp.broadcast_to(one.channel, weight.shape),
+            num_channels=settings.num_channels,
+            multiple=settings.multiple,
+        )
+
+    # Shifts stay clear of 0 from both sides: motion is alike within a few frames.
+    clear = min(3, num_frames // 4)
+    shifts = jax.random.randint(key, (num_tags, settings.num_shifts), clear, max(num_frames - clear, clear + 1))
+    rolled = jax.vmap(lambda step, shift: jax.vmap(lambda by: jnp.roll(step, by))(shift))(steps, shifts)
+    altered = jnp.concatenate([rolled, -steps[:, None]], axis=1)
+    over_motions = jax.vmap(score, in_axes=(None, None, 0))
+    between = jax.vmap(over_motions, in_axes=(0, 0, None))(reads, inside, steps)
+    still = jax.vmap(score, in_axes=(0, 0, None))(reads, inside, jnp.zeros(num_frames))
+    weight = jnp.any(inside, axis=-1) * jax.nn.relu(1.0 - still)
+    return Agreement(between, jax.vmap(over_motions)(reads, inside, altered), still, jax.lax.stop_gradient(weight))
+
+
+def contrast(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """InfoNCE: own reads with the own mask's motion against every other pairing; log(candidates) by chance.
+
+    Negatives: own reads with other masks' motion, other tags' reads with the own motion, and own reads with the own
+    motion shifted in time, mirrored, or at rest. Pieces weigh as much as their tag moves.
+    """
+    found = agreement(seen, settings, key)
+    num_tags = found.between.shape[0]
+    own = jnp.einsum("iip->ip", found.between)
+    other = jnp.eye(num_tags, dtype=bool)[:, :, None]
+    masked = jnp.where(other, -jnp.inf, found.between)
+    candidates = jnp.concatenate(
+        [own[:, None], masked, jnp.swapaxes(masked, 0, 1), found.altered, found.still[:, None]], axis=1
+    )
+    loss = jax.nn.logsumexp(candidates / settings.temperature, axis=1) - own / settings.temperature
+    weight = found.weight
+    mean = lambda values: safe_divide(jnp.sum(values * weight), jnp.sum(weight))  # noqa: E731
+    best = jnp.max(candidates[:, 1:], axis=1)
+    return mean(loss), {
+        "own_coherence": mean(own),
+        "best_other_coherence": mean(best),
+        "own_wins": mean((own > best).astype(own.dtype)),
+        "moving": jnp.mean(weight),
+    }
+
+
+def coverage(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """1 - Dice of the mask, made from the past, with the pixels whose motion in the coming window is the tag's.
+
+    Keeps the mask from shrinking to a few sure pixels. Nothing flows back into the pixels' future.
+    """
+    del key
+    agrees, valid, weight = future_agreement(seen.camera, seen.frames, settings)
+    stride, num_asked = settings.future_stride, agrees.shape[0]
+    mask = jnp.where(valid[:, None], seen.said.mask[:num_asked, :, ::stride, ::stride], 0.0)
+    overlap = jnp.sum(mask * agrees, axis=(-2, -1))
+    size = jnp.sum(mask * mask, axis=(-2, -1)) + jnp.sum(agrees * agrees, axis=(-2, -1))
+    dice = safe_divide(2.0 * overlap, size)
+    started = jnp.arange(num_asked) >= min(settings.skip_frames, num_asked - 1)
+    weight = weight * started[:, None]
+    loss = safe_divide(jnp.sum((1.0 - dice) * weight), jnp.sum(weight))
+    return loss, {"mask_share": jnp.mean(seen.said.mask)}
+
+
+def future_agreement(
+    camera: Camera, frames: Frame, settings: ObjectiveSettings
+) -> tuple[Float[Array, "asked tag rows columns"], Bool[Array, "asked rows columns"], Float[Array, "asked tag"]]:
+    """How well each pixel's motion over the next k - 1 frames agrees with the tag's, beyond what a resting pixel does.
+
+    Pixels are followed along the forward flow to the nearest pixel; those lost on the way, or that jump, are not
+    valid. The radio's window that ends k - 1 frames later tells the tag's motion. The weight says how far from rest
+    the tag was.
+    """
+    num_window = frames.radio.relative_m.shape[-1]
+    num_frames, height, width = frames.depth_m.shape
+    num_asked = max(num_frames - (num_window - 1), 1)
+    if num_frames < num_window:
+        raise ValueError(f"A clip of {num_frames} frames is too short for the window of {num_window}; lengthen it.")
+    stride = settings.future_stride
+    distance = safe_norm(camera.rays[None] * frames.depth_m[..., None] - camera.antenna_m)
+    distance = jnp.where(frames.depth_m > 0, distance, 0.0)
+    rows, columns = jnp.meshgrid(jnp.arange(0, height, stride), jnp.arange(0, width, stride), indexing="ij")
+
+    def follow(start: Int[Array, ""]) -> tuple[Array, Array]:
+        x, y = columns.astype(jnp.float32), rows.astype(jnp.float32)
+        at = distance[start][rows, columns]
+        valid, values = at > 0, [at]
+        for ahead in range(1, num_window):
+            column, row = jnp.round(x).astype(jnp.int32), jnp.round(y).astype(jnp.int32)
+            flow = frames.forward_px[start + ahead][jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+            x, y = x + flow[..., 0], y + flow[..., 1]
+            column, row = jnp.round(x).astype(jnp.int32), jnp.round(y).astype(jnp.int32)
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            at = distance[start + ahead][jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+            valid = valid & inside & (at > 0) & (jnp.abs(at - values[-1]) < 0.5)
+            values.append(at)
+        return jnp.stack(values, axis=-1), valid
+
+    followed, valid = jax.vmap(follow)(jnp.arange(num_asked))
+    centred = followed - jnp.mean(followed, axis=-1, keepdims=True)
+    radio = jax.tree.map(lambda leaf: leaf[num_window - 1 :], frames.radio)
+    known = jnp.all(jnp.isfinite(radio.std_m), axis=-1)
+    tag = jnp.where(known[..., None], radio.relative_m, 0.0)
+    tag = tag - jnp.mean(tag, axis=-1, keepdims=True)
+    spread = settings.future_alpha_m2 + jnp.where(known, jnp.mean(jnp.square(radio.std_m), axis=-1), 0.0)
+    misfit = jnp.mean(jnp.square(centred[:, None] - tag[:, :, None, None]), axis=-1)
+    agrees = jnp.exp(-misfit / (2.0 * spread[..., None, None]))
+    resting = jnp.exp(-jnp.mean(jnp.square(tag), axis=-1) / (2.0 * spread))
+    weight = jnp.where(known, 1.0 - resting, 0.0)
+    beyond = safe_divide(
+        jax.nn.relu(agrees - resting[..., None, None]), jnp.broadcast_to(weight[..., None, None], agrees.shape)
+    )
+    return jax.lax.stop_gradient((jnp.where(valid[:, None], beyond, 0.0), valid, weight))
+
+
+Term = Callable[[Seen, ObjectiveSettings, Array], tuple[Float[Array, ""], dict[str, Array]]]
+
+TERMS: Mapping[str, Term] = {"contrast": contrast, "coverage": coverage}
+"""The terms of the objective by name; `ObjectiveSettings` has a weight of each name."""
+
+
+def objective(
+    tracer: AbstractTracer, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
+    """Every term that has a weight, unweighted, and diagnostics, of one clip."""
+    seen = see(tracer, camera, frames, settings)
+    terms, diagnostics = {}, {}
+    for name in settings.weights():
+        terms[name], more = TERMS[name](seen, settings, key)
+        diagnostics.update(more)
+    return terms, diagnostics

@@ -1,0 +1,65 @@
+"""Curves of scores against frame number (TagAttention, Figs. 12-15), one line a tracer. Needs the viz extra."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Shaped
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+
+def score_curves(
+    path: Path,
+    lines: Mapping[str, Mapping[str, Shaped[np.ndarray, " time"]]],
+    valid: Shaped[np.ndarray, " time"],
+    *,
+    first_frame: int = 0,
+    title: str = "",
+) -> None:
+    """Write a PNG with IoU and centre error (CLE) of each tracer against frame number.
+
+    `lines` maps a tracer's name to its `iou` and `cle_px`; frames that are not scored are shaded.
+    """
+    frame = first_frame + np.arange(len(valid))
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for name, line in lines.items():
+        upper.plot(frame, line["iou"], label=name, linewidth=1.4)
+        lower.plot(frame, line["cle_px"], label=name, linewidth=1.4)
+    for axes in (upper, lower):
+        left_out = ~np.asarray(valid, dtype=bool)
+        axes.fill_between(
+            frame,
+            0,
+            1,
+            where=left_out.tolist(),
+            step="mid",
+            color="0.9",
+            transform=axes.get_xaxis_transform(),
+            zorder=0,
+        )
+        axes.grid(alpha=0.3)
+    upper.set(ylabel="box IoU", ylim=(-0.02, 1.02), title=title)
+    lower.set(ylabel="CLE (px of 512)", xlabel="frame number (shaded: not scored)")
+    lower.set_ylim(bottom=0)
+    upper.legend(loc="upper right", fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def training_curves(
+    path: Path, steps: Float[np.ndarray, " step"], terms: Mapping[str, Float[np.ndarray, " step"]]
+) -> None:
+    """Write a PNG with each term of the training objective against the step."""
+    figure = Figure(figsize=(8, 2.2 * max(len(terms), 1)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (name, values) in zip(
+        np.atleast_1d(figure.subplots(len(terms), 1, sharex=True)), terms.items(), strict=True
+    ):
+        axes.plot(steps, values, linewidth=1.2)
+        axes.set_ylabel(name)
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,65 @@
+"""Overlay pictures: what the tracer says drawn over the colour picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Shaped, UInt8
+
+PALETTE_RGB = (
+    (255, 99, 71),
+    (64, 156, 255),
+    (80, 200, 120),
+    (255, 200, 40),
+    (190, 110, 255),
+    (0, 210, 210),
+    (255, 130, 200),
+    (170, 140, 90),
+)
+"""Colours of tags in their order, told apart on a dim room as well as on a bright one."""
+
+
+def draw_overlay(
+    colour: UInt8[np.ndarray, "height width 3"],
+    names: Sequence[str],
+    masks: Bool[np.ndarray, "tag height width"],
+    boxes_px: Float[np.ndarray, "tag 4"],
+    confidence: Float[np.ndarray, " tag"],
+    found: Bool[np.ndarray, " tag"],
+    *,
+    true_boxes_px: Shaped[np.ndarray, "tag 4"] | None = None,
+    caption: str = "",
+) -> UInt8[np.ndarray, "height width 3"]:
+    """RGB picture with each claimed object's tint, outline, box, name and confidence; true boxes thin and white."""
+    picture = np.ascontiguousarray(colour).copy()
+    for tag, name in enumerate(names):
+        shade = PALETTE_RGB[tag % len(PALETTE_RGB)]
+        if true_boxes_px is not None and np.all(np.isfinite(true_boxes_px[tag])):
+            x0, y0, x1, y1 = np.round(true_boxes_px[tag]).astype(int).tolist()
+            cv2.rectangle(picture, (x0, y0), (x1, y1), (255, 255, 255), 1)
+        if not found[tag] or not np.all(np.isfinite(boxes_px[tag])):
+            continue
+        mask = masks[tag]
+        tinted = 0.65 * picture[mask].astype(np.float32) + 0.35 * np.array(shade, np.float32)
+        picture[mask] = tinted.astype(np.uint8)
+        outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, outline, -1, shade, 1)
+        x0, y0, x1, y1 = np.round(boxes_px[tag]).astype(int).tolist()
+        cv2.rectangle(picture, (x0, y0), (x1, y1), shade, 2)
+        _text(picture, f"{name} {confidence[tag]:.2f}", (x0, max(y0 - 5, 12)), shade)
+    if caption:
+        _text(picture, caption, (6, picture.shape[0] - 8), (255, 255, 255))
+    return picture
+
+
+def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
+    # A dark rim under the letters keeps them readable on any background.
+    for colour, thickness in (((0, 0, 0), 3), (shade, 1)):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+
+
+def short_name(epc: str, length: int = 10) -> str:
+    """An EPC short enough for a picture: its end, which is where EPCs of one batch differ."""
+    return epc if len(epc) <= length else f"..{epc[-length:]}"

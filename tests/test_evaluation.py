@@ -1,0 +1,148 @@
+"""Evaluation of whole recordings: agreement with one scan, sizes, pictures, report."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+import pytest
+import synthetic_clips as synthetic
+
+from tagjax.evaluation.evaluate import (
+    ScoreSettings,
+    box_to_picture,
+    evaluate_recording,
+    mask_to_picture,
+    trace_recording,
+)
+from tagjax.evaluation.report import plain, score_table, summarise, write_report
+from tagjax.recording import RecordingError
+from tagjax.tracer import trace
+
+EPCS = list(synthetic.EPCS)
+
+
+@pytest.mark.parametrize(("frames_at_once", "tags_at_once"), [(7, 1), (50, 2), (16, 6)])
+def test_pieces_and_groups_give_what_one_scan_gives(frames_at_once: int, tags_at_once: int) -> None:
+    recording = synthetic.recording(20)
+    tracer = synthetic.SmallTracer()
+    clip = synthetic.load(recording, 0, 20, epcs=EPCS)
+    whole = trace(tracer, clip.camera, clip.frames)
+    settings = ScoreSettings(frames_at_once=frames_at_once, tags_at_once=tags_at_once)
+    pieces = list(trace_recording(tracer, recording, synthetic.load, epcs=EPCS, settings=settings))
+    assert [number for number, _ in pieces] == list(range(20))
+    for number, said in pieces:
+        expected = jax.tree.map(lambda leaf, n=number: np.asarray(leaf[n]), whole)
+        for got, wanted in zip(jax.tree.leaves(said), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(got, wanted, rtol=2e-5, atol=2e-6)
+
+
+def test_three_tags_in_groups_of_two_keep_their_order() -> None:
+    recording = synthetic.recording(8)
+    names = ["tag-b", "tag-a", "tag-b"]
+    settings = ScoreSettings(tags_at_once=2)
+    _, said = list(trace_recording(synthetic.SmallTracer(), recording, synthetic.load, epcs=names, settings=settings))[
+        -1
+    ]
+    assert said.mask.shape[0] == 3
+    np.testing.assert_allclose(said.mask[0], said.mask[2], rtol=1e-5)
+    assert np.abs(said.mask[0] - said.mask[1]).max() > 0.1
+
+
+def test_the_object_is_found_named_and_outlined() -> None:
+    recording = synthetic.recording(40)
+    result = evaluate_recording(synthetic.SmallTracer(), recording, synthetic.load, stride=1)
+    scores = result.scores().result()
+    assert scores["iou"] == pytest.approx(1.0)
+    assert scores["mask_j"] == pytest.approx(1.0)
+    assert scores["cle_px"] == pytest.approx(0.0)
+    assert scores["identification"] == 1.0
+    assert len(result.pictures) == ScoreSettings().num_pictures
+    # Swapped names in the truth must show as wrong identification and no overlap.
+    truth = dataclasses.replace(recording.truth, tag_to_label={"tag-a": 2, "tag-b": 1})
+    swapped = evaluate_recording(
+        synthetic.SmallTracer(), dataclasses.replace(recording, truth=truth), synthetic.load, stride=1
+    )
+    assert swapped.scores().result()["identification"] == 0.0
+    assert swapped.scores().result()["iou"] == 0.0
+
+
+def test_without_truth_there_are_pictures_but_no_scores() -> None:
+    recording = synthetic.recording(12)
+
+    def load(_, start, stop, *, epcs):  # the clip still needs the true radio
+        return synthetic.load(recording, start, stop, epcs=epcs)
+
+    blind = dataclasses.replace(recording, truth=None)
+    result = evaluate_recording(synthetic.SmallTracer(), blind, load, stride=1)
+    assert result.frames == {}
+    assert result.pictures
+    assert summarise({"it": [result]})["it"]["all"]["num_frames"] == 0
+
+
+def test_bad_requests_say_what_is_wrong() -> None:
+    recording = synthetic.recording(12)
+    with pytest.raises(RecordingError, match="never read"):
+        evaluate_recording(synthetic.SmallTracer(), recording, synthetic.load, stride=1, epcs=["unknown"])
+    with pytest.raises(RecordingError, match="0 to 12"):
+        evaluate_recording(synthetic.SmallTracer(), recording, synthetic.load, stride=1, frames=(5, 40))
+    with pytest.raises(RecordingError, match="no tag to trace"):
+        list(trace_recording(synthetic.SmallTracer(), recording, synthetic.load, epcs=[]))
+
+
+def test_working_pixels_land_on_their_own_place_in_the_picture() -> None:
+    mask = np.zeros((6, 8), np.float32)
+    mask[2:4, 3:6] = 1.0
+    large = mask_to_picture(mask, 4, 24, 32)
+    np.testing.assert_allclose(large[::4, ::4], mask, atol=1e-6)
+    box = box_to_picture(np.array([3.0, 2.0, 5.0, 3.0]), 4, 24, 32)
+    # Pixel i stands for the pixels around i * 4: each side reaches 1.5 pixels beyond the outermost centres.
+    np.testing.assert_allclose(box, [10.5, 6.5, 21.5, 13.5])
+    rows, columns = np.nonzero(large >= 0.5)
+    assert abs(columns.min() - box[0]) <= 1
+    assert abs(rows.max() - box[3]) <= 1
+    np.testing.assert_array_equal(box_to_picture(np.array([0.0, 0.0, 7.0, 5.0]), 4, 24, 32), [0, 0, 29.5, 21.5])
+
+
+def test_report_is_complete(tmp_path: Path) -> None:
+    recording = synthetic.recording(30)
+    settings = ScoreSettings(num_pictures=3)
+    results = {
+        "learned": [
+            evaluate_recording(synthetic.SmallTracer(), recording, synthetic.load, stride=1, settings=settings)
+        ],
+        "blunt": [
+            evaluate_recording(synthetic.SmallTracer(1.0), recording, synthetic.load, stride=1, settings=settings)
+        ],
+    }
+    summary = write_report(tmp_path, results)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == plain(summary)
+    assert summary["learned"]["all"]["iou"] > summary["blunt"]["all"]["iou"]
+    with (tmp_path / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * 30
+    by_hand = [
+        float(r["iou"]) for r in rows if r["tracer"] == "blunt" and r["shown"] == r["moved"] == r["found"] == "1"
+    ]
+    assert summary["blunt"]["all"]["iou"] == pytest.approx(np.sum(by_hand) / summary["blunt"]["all"]["num_frames"])
+    pictures = sorted((tmp_path / "overlays" / "synthetic" / "learned").glob("*.png"))
+    assert len(pictures) == 3
+    drawn = cv2.imread(str(pictures[-1]))
+    assert drawn.shape == (synthetic.HEIGHT, synthetic.WIDTH, 3)
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 3  # something is drawn on the uniform grey
+    assert len(list((tmp_path / "curves").glob("*.png"))) == 2
+    assert score_table(summary).row_count == 2
+
+
+def test_plain_json_has_no_nan() -> None:
+    odd = {"a": [np.float32(1.5), float("nan")], "b": {"c": np.arange(2), 3: np.bool_(True)}, "d": float("inf")}
+    assert json.loads(json.dumps(plain(odd), allow_nan=False)) == {
+        "a": [1.5, None],
+        "b": {"c": [0, 1], "3": True},
+        "d": None,
+    }
