@@ -101,7 +101,7 @@ class TagAttention(AbstractTracer):
         gate_width_m_s: float = 0.05,
         forgetting: float = 0.93,
         evidence_limit: float = 12.0,
-        pool_motion: float = 0.8,
+        pool_motion: float = 0.9,
         pool_log_odds: float = 0.8,
         segment_temperature_m: float = 0.06,
         diffusion: float = 0.5,
@@ -111,8 +111,8 @@ class TagAttention(AbstractTracer):
         cut_width: float = 0.5,
         cut_margin: float = 2.0,
         extent_m: float = 0.8,
-        prior_weight: float = 6.0,
-        prior_radius_m: float = 0.4,
+        prior_weight: float = 8.0,
+        prior_radius_m: float = 0.5,
         inertia: float = 0.9,
         cell: int = 8,
         max_speed_m_s: float = 3.0,
@@ -226,8 +226,8 @@ class TagAttention(AbstractTracer):
             )
             predicted = centre + velocity * elapsed_s * jax.nn.sigmoid(self.logit_inertia)
             mask, new_centre = self._cut(points, valid, smooth, predicted, confidence)
-            inside = jnp.max(jnp.where((mask > 0.5) & valid, refined, -jnp.inf))
-            new_confidence = jax.nn.sigmoid(jnp.where(jnp.isfinite(inside), inside, -9.0))
+            inside = jnp.max(jnp.where((mask > 0.5) & valid, refined, -9.0))
+            new_confidence = jax.nn.sigmoid(inside)
             both = (confidence > 0.5) & (new_confidence > 0.5)
             move = jnp.clip((new_centre - centre) / elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
             new_velocity = jnp.where(both, 0.5 * velocity + 0.5 * move, 0.0)

@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -33,3 +35,35 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder} (set TAGJAX_REAL_DATA)")
     return folder.resolve()
+
+
+def check_gradients(function, arguments, *, atol: float = 1e-6, rtol: float = 1e-5, step: float = 1e-6) -> None:
+    """Compare reverse-mode gradients of a scalar projection with central differences, in x64, element by element."""
+    with jax.enable_x64(True):
+        arguments = tuple(jnp.asarray(np.asarray(a), jnp.float64) for a in arguments)
+        shape = jax.eval_shape(function, *arguments)
+        direction = jnp.asarray(np.random.default_rng(0).normal(size=shape.shape))
+
+        def scalar(*args):
+            return jnp.sum(direction * function(*args))
+
+        gradients = jax.grad(scalar, argnums=tuple(range(len(arguments))))(*arguments)
+        for position, (argument, gradient) in enumerate(zip(arguments, gradients, strict=True)):
+            flat = np.asarray(argument).reshape(-1)
+            numeric = np.empty_like(flat)
+            for i in range(flat.size):
+                ends = []
+                for sign in (1, -1):
+                    moved = flat.copy()
+                    moved[i] += sign * step
+                    args = list(arguments)
+                    args[position] = jnp.asarray(moved.reshape(argument.shape))
+                    ends.append(float(scalar(*args)))
+                numeric[i] = (ends[0] - ends[1]) / (2 * step)
+            np.testing.assert_allclose(np.asarray(gradient).reshape(-1), numeric, atol=atol, rtol=rtol)
+
+
+@pytest.fixture(scope="session")
+def gradients_agree():
+    """`check_gradients`, for tests."""
+    return check_gradients

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-_EPS = 1e-6
+_TINY = 1e-12
 
 
 def _taps(
@@ -26,9 +27,11 @@ def _taps(
     return jnp.stack(index), jnp.stack(weight)
 
 
-def pixel_grid(height: int, width: int) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
+def pixel_grid(
+    height: int, width: int, dtype: DTypeLike = jnp.float32
+) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
     """The x (column) and y (row) coordinate of every pixel centre."""
-    x, y = jnp.meshgrid(jnp.arange(width, dtype=jnp.float32), jnp.arange(height, dtype=jnp.float32))
+    x, y = jnp.meshgrid(jnp.arange(width, dtype=dtype), jnp.arange(height, dtype=dtype))
     return x, y
 
 
@@ -37,7 +40,7 @@ def gather_taps(
 ) -> tuple[Float[Array, "4 height width channel"], Float[Array, "4 height width"]]:
     """The four values around `pixel + flow` with their bilinear weights (0 outside), for a caller's own mixture."""
     height, width, channels = image.shape
-    x, y = pixel_grid(height, width)
+    x, y = pixel_grid(height, width, flow_px.dtype)
     index, weight = _taps(x + flow_px[..., 0], y + flow_px[..., 1], (height, width))
     values = jnp.take(image.reshape(-1, channels), index.reshape(-1), axis=0)
     return values.reshape(4, height, width, channels), weight
@@ -57,7 +60,7 @@ def gather(
         known, _ = gather_taps(valid.astype(image.dtype)[..., None], flow_px)
         weight = weight * known[..., 0]
     total = jnp.sum(weight, axis=0)
-    mixed = jnp.sum(values * weight[..., None], axis=0) / jnp.maximum(total, _EPS)[..., None]
+    mixed = jnp.sum(values * weight[..., None], axis=0) / jnp.maximum(total, _TINY)[..., None]
     covered = total >= 0.5
     return jnp.where(covered[..., None], mixed, 0.0), covered
 
@@ -74,14 +77,14 @@ def splat(
     anything landed; holes are 0 and False. Differentiable in image, flow and importance.
     """
     height, width, channels = image.shape
-    x, y = pixel_grid(height, width)
+    x, y = pixel_grid(height, width, flow_px.dtype)
     index, weight = _taps(x + flow_px[..., 0], y + flow_px[..., 1], (height, width))
     if importance is not None:
-        weight = weight * importance
+        weight = weight * importance[None]
     rows = jnp.concatenate([image, jnp.ones((height, width, 1), image.dtype)], axis=-1)
-    contribution = (rows * weight[..., None]).reshape(-1, channels + 1)
+    contribution = (rows[None] * weight[..., None]).reshape(-1, channels + 1)
     summed = jnp.zeros((height * width, channels + 1), image.dtype).at[index.reshape(-1)].add(contribution)
     summed = summed.reshape(height, width, channels + 1)
     total = summed[..., -1]
-    filled = total > _EPS
-    return jnp.where(filled[..., None], summed[..., :-1] / jnp.maximum(total, _EPS)[..., None], 0.0), filled
+    filled = total > _TINY
+    return jnp.where(filled[..., None], summed[..., :-1] / jnp.maximum(total, _TINY)[..., None], 0.0), filled

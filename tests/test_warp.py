@@ -1,0 +1,95 @@
+"""Warps against closed forms, OpenCV and finite differences."""
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tagjax.image.warp import gather, splat
+
+
+def _smooth(shape, seed=0):
+    rng = np.random.default_rng(seed)
+    blurred = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), 2.0)
+    return np.ascontiguousarray(blurred).reshape(shape)
+
+
+def test_gather_with_zero_flow_is_the_identity():
+    image = jnp.asarray(_smooth((12, 17, 3)))
+    out, covered = gather(image, jnp.zeros((12, 17, 2)))
+    np.testing.assert_array_equal(out, image)
+    assert bool(covered.all())
+
+
+def test_gather_agrees_with_opencv_remap():
+    image = _smooth((24, 31))
+    flow = 2.0 * _smooth((24, 31, 2), seed=1)
+    x, y = np.meshgrid(np.arange(31, dtype=np.float32), np.arange(24, dtype=np.float32))
+    target_x, target_y = x + flow[..., 0], y + flow[..., 1]
+    inside = (target_x >= 0) & (target_x <= 30) & (target_y >= 0) & (target_y <= 23)
+    expected = cv2.remap(image, target_x, target_y, cv2.INTER_LINEAR)
+    out, covered = gather(jnp.asarray(image)[..., None], jnp.asarray(flow))
+    assert bool(np.asarray(covered)[inside].all())
+    # OpenCV rounds the weights of its bilinear remap to 1/32 of a pixel.
+    np.testing.assert_allclose(np.asarray(out)[inside, 0], expected[inside], atol=0.03 * np.ptp(image))
+
+
+def test_gather_leaves_invalid_pixels_out():
+    image = jnp.asarray([[[1.0], [100.0], [3.0]]])
+    valid = jnp.asarray([[True, False, True]])
+    flow = jnp.zeros((1, 3, 2)).at[0, 0, 0].set(0.25)
+    out, covered = gather(image, flow, valid)
+    assert out[0, 0, 0] == 1.0
+    assert covered.tolist() == [[True, False, True]]
+    assert out[0, 1, 0] == 0.0
+
+
+def test_gather_outside_the_picture_is_not_covered():
+    _, covered = gather(jnp.ones((4, 4, 1)), jnp.full((4, 4, 2), 10.0))
+    assert not covered.any()
+
+
+def test_splat_by_whole_pixels_moves_the_image_and_marks_the_hole():
+    image = jnp.asarray(_smooth((8, 9, 2)))
+    flow = jnp.broadcast_to(jnp.asarray([2.0, -1.0]), (8, 9, 2))
+    out, filled = splat(image, flow)
+    np.testing.assert_allclose(out[:-1, 2:], image[1:, :-2], atol=1e-6)
+    assert bool(filled[:-1, 2:].all())
+    assert not filled[-1].any()
+    assert not filled[:, :2].any()
+    assert float(jnp.abs(out[-1]).max()) == 0.0
+
+
+def test_splat_importance_lets_the_nearer_win():
+    image = jnp.asarray([[[1.0], [2.0]]])
+    flow = jnp.zeros((1, 2, 2)).at[0, 0, 0].set(1.0)
+    out, _ = splat(image, flow, jnp.exp(-jnp.asarray([[1.0, 3.0]]) / 0.05))
+    np.testing.assert_allclose(out[0, 1, 0], 1.0, atol=1e-6)
+
+
+def test_splat_conserves_mass_inside():
+    """Splat is the adjoint of gather: <splat mass, image> = <1, gather(image)>."""
+    rng = np.random.default_rng(3)
+    flow = jnp.asarray(np.pad(rng.uniform(-1, 1, (6, 7, 2)).astype(np.float32), ((2, 2), (2, 2), (0, 0))))
+    image = jnp.asarray(_smooth((10, 11, 1)))
+    gathered, _ = gather(image, flow)
+    mass = jax.grad(lambda im: jnp.sum(gather(im, flow)[0]))(image)
+    np.testing.assert_allclose(jnp.sum(mass * image), jnp.sum(gathered), rtol=1e-5)
+    np.testing.assert_allclose(jnp.sum(mass), 110.0, rtol=1e-5)
+
+
+def test_gradients_agree_with_finite_differences(gradients_agree):
+    image = _smooth((5, 6, 2))
+    # Off the integers, where bilinear interpolation has its kinks.
+    flow = np.random.default_rng(1).uniform(0.2, 0.8, (5, 6, 2))
+    importance = np.random.default_rng(2).uniform(0.5, 1.0, (5, 6))
+    gradients_agree(lambda im, f: gather(im, f)[0][1:-2, 1:-2], (image, flow))
+    gradients_agree(lambda im, f, w: splat(im, f, w)[0], (image, flow, importance))
+
+
+def test_jit_and_vmap_change_nothing():
+    images = jnp.stack([jnp.asarray(_smooth((6, 7, 2), seed)) for seed in range(3)])
+    flows = jnp.stack([jnp.asarray(_smooth((6, 7, 2), 10 + seed)) for seed in range(3)])
+    for warp in (gather, splat):
+        looped = jnp.stack([warp(im, f)[0] for im, f in zip(images, flows, strict=True)])
+        np.testing.assert_allclose(jax.jit(jax.vmap(warp))(images, flows)[0], looped, atol=1e-6)
