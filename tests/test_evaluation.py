@@ -64,6 +64,7 @@ def test_the_object_is_found_named_and_outlined() -> None:
     assert scores["identification"] == 1.0
     assert len(result.pictures) == ScoreSettings().num_pictures
     # Swapped names in the truth must show as wrong identification and no overlap.
+    assert recording.truth is not None
     truth = dataclasses.replace(recording.truth, tag_to_label={"tag-a": 2, "tag-b": 1})
     swapped = evaluate_recording(
         synthetic.SmallTracer(), dataclasses.replace(recording, truth=truth), synthetic.load, stride=1
@@ -133,6 +134,7 @@ def test_report_is_complete(tmp_path: Path) -> None:
     pictures = sorted((tmp_path / "overlays" / "synthetic" / "learned").glob("*.png"))
     assert len(pictures) == 3
     drawn = cv2.imread(str(pictures[-1]))
+    assert drawn is not None
     assert drawn.shape == (synthetic.HEIGHT, synthetic.WIDTH, 3)
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 3  # something is drawn on the uniform grey
     assert len(list((tmp_path / "curves").glob("*.png"))) == 2

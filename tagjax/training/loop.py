@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import optax
@@ -20,6 +20,7 @@ from .state import TrainState
 from .step import ClipLike, train_step
 
 
+@runtime_checkable
 class ClipIterator(Protocol):
     """An endless source of clips whose place can be kept: what Grain's iterators are."""
 

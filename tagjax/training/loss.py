@@ -32,6 +32,7 @@ class ObjectiveSettings:
     span_frames: int = 10  # coherence is taken over pieces this long: drift of the sum does not reach further
     skip_frames: int = 5  # at the start of a clip, while the tracer has not seen a full window
     min_reads: int = 6  # a piece with fewer reads says nothing
+    rest_margin: float = 0.05  # a piece whose reads lose less coherence than this by taking the tag to rest is left out
     max_reads: int = 384  # reads of one tag in a clip
     num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
     multiple: int = 2  # 2 takes phases modulo pi: right whether the reader flips or not
@@ -146,7 +147,7 @@ def agreement(seen: Seen, settings: ObjectiveSettings, key: Array) -> Agreement:
 
     def score(one: PhaseReads, member: Bool[Array, "piece reads"], step_m: Float[Array, " time"]) -> Array:
         residual = phase_residual(one.phase_rad, one.carrier_hz, distance_at(step_m, time_s, one.time_s))
-        weight = member / (jnp.square(one.sigma_rad) + 0.1)
+        weight = member.astype(residual.dtype) / (jnp.square(one.sigma_rad) + 0.1)[None]
         return coherence(
             jnp.broadcast_to(residual, weight.shape),
             weight,
@@ -163,7 +164,8 @@ def agreement(seen: Seen, settings: ObjectiveSettings, key: Array) -> Agreement:
     over_motions = jax.vmap(score, in_axes=(None, None, 0))
     between = jax.vmap(over_motions, in_axes=(0, 0, None))(reads, inside, steps)
     still = jax.vmap(score, in_axes=(0, 0, None))(reads, inside, jnp.zeros(num_frames))
-    weight = jnp.any(inside, axis=-1) * jax.nn.relu(1.0 - still)
+    # Reads of a resting tag are coherent with no motion at all, but for their noise.
+    weight = jnp.where(jnp.any(inside, axis=-1), jax.nn.relu(1.0 - still - settings.rest_margin), 0.0)
     return Agreement(between, jax.vmap(over_motions)(reads, inside, altered), still, jax.lax.stop_gradient(weight))
 
 
@@ -204,9 +206,9 @@ def coverage(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float
     mask = jnp.where(valid[:, None], seen.said.mask[:num_asked, :, ::stride, ::stride], 0.0)
     overlap = jnp.sum(mask * agrees, axis=(-2, -1))
     size = jnp.sum(mask * mask, axis=(-2, -1)) + jnp.sum(agrees * agrees, axis=(-2, -1))
-    dice = safe_divide(2.0 * overlap, size)
+    dice = 2.0 * overlap / (size + 1.0)  # one pixel more keeps the gradient of a vanishing mask finite
     started = jnp.arange(num_asked) >= min(settings.skip_frames, num_asked - 1)
-    weight = weight * started[:, None]
+    weight = jnp.where(started[:, None], weight, 0.0)
     loss = safe_divide(jnp.sum((1.0 - dice) * weight), jnp.sum(weight))
     return loss, {"mask_share": jnp.mean(seen.said.mask)}
 
@@ -226,12 +228,12 @@ def future_agreement(
     if num_frames < num_window:
         raise ValueError(f"A clip of {num_frames} frames is too short for the window of {num_window}; lengthen it.")
     stride = settings.future_stride
-    distance = safe_norm(camera.rays[None] * frames.depth_m[..., None] - camera.antenna_m)
+    distance = safe_norm(camera.rays[None] * frames.depth_m[..., None] - camera.antenna_m[None, None, None])
     distance = jnp.where(frames.depth_m > 0, distance, 0.0)
     rows, columns = jnp.meshgrid(jnp.arange(0, height, stride), jnp.arange(0, width, stride), indexing="ij")
 
     def follow(start: Int[Array, ""]) -> tuple[Array, Array]:
-        x, y = columns.astype(jnp.float32), rows.astype(jnp.float32)
+        x, y = columns.astype(distance.dtype), rows.astype(distance.dtype)
         at = distance[start][rows, columns]
         valid, values = at > 0, [at]
         for ahead in range(1, num_window):

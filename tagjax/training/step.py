@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from .loss import ObjectiveSettings, objective
 from .state import TrainState
 
 
+@runtime_checkable
 class ClipLike(Protocol):
     """What a step needs of a clip."""
 
@@ -51,7 +52,7 @@ def clip_gradient(
         (gradient,) = pull({other: jnp.asarray(float(other == name), values[name].dtype) for other in weights})
         total = jax.tree.map(lambda sum_, part, w=weight: sum_ + w * part, total, gradient)
         logged[name] = values[name]
-        logged[f"gradient_norm/{name}"] = optax.global_norm(gradient)
+        logged[f"gradient_norm/{name}"] = optax.tree.norm(gradient)
     logged["loss"] = sum((weight * values[name] for name, weight in weights.items()), start=jnp.zeros(()))
     return total, logged
 
@@ -71,11 +72,12 @@ def clip_loss(
 def _apply(
     state: TrainState, gradient: PyTree, loss: Array, optimizer: optax.GradientTransformation
 ) -> tuple[TrainState, dict[str, Array]]:
-    norm = optax.global_norm(gradient)
+    norm = optax.tree.norm(gradient)
     usable = jnp.isfinite(norm) & jnp.isfinite(loss)
     safe = jax.tree.map(lambda g: jnp.where(usable, g, jnp.zeros_like(g)), gradient)
     learnable, rest = eqx.partition(state.tracer, eqx.is_inexact_array)
-    updates, optimizer_state = optimizer.update(safe, state.optimizer_state, learnable)
+    with jax.numpy_dtype_promotion("standard"):  # Optax takes powers of its integer step count
+        updates, optimizer_state = optimizer.update(safe, state.optimizer_state, learnable)
     keep = lambda new, old: jnp.where(usable, new, old)  # noqa: E731
     tracer = eqx.combine(jax.tree.map(keep, optax.apply_updates(learnable, updates), learnable), rest)
     optimizer_state = jax.tree.map(keep, optimizer_state, state.optimizer_state)
