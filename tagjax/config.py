@@ -1,0 +1,209 @@
+"""Typed schemas of every configuration, and the helpers that turn plain dictionaries into them.
+
+YAML under conf/ is the one home of tunables: a schema names what may be set and of which type, and an unknown or
+mistyped key is refused. Real alternatives are named by `_target_` and built by `build`, which reaches no further
+than this package and Optax.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeVar
+
+from .evaluation.evaluate import ScoreSettings
+from .training.logging import LoggerSettings
+from .training.loop import LoopSettings
+from .training.loss import ObjectiveSettings
+
+TARGET_PREFIXES = ("tagjax.", "optax.")
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used: which key, what was found, what was expected."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipSettings:
+    """How recordings become clips."""
+
+    stride: int = 4  # every n-th pixel in both directions
+    window: int = 5  # frames in a motion vector (k)
+    max_reads: int = 64  # reads of one tag in a window
+    flow: str = "dis"
+    length: int = 24  # frames of a training clip
+    epcs: tuple[str, ...] | None = None  # all that were read
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulateSettings:
+    """The simulated recordings used where none are named; made once and kept under `folder`."""
+
+    num_recordings: int = 3
+    num_frames: int = 90
+    seed: int = 0
+    validation_seed: int = 1000
+    folder: str = "recordings"
+
+
+@dataclasses.dataclass(frozen=True)
+class VirtualTagSettings:
+    """Virtual tags for recordings whose tracks are known: each label in turn, by itself, at the full read rate."""
+
+    tracks: str | None = None  # CSV: frame,person,x_m,y_m,z_m,range_m,visible
+    labels: str | None = None  # folder of label masks NNNNNNNN.png
+    seeds: tuple[int, ...] = (0,)
+    reader: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of the reader's settings
+
+
+@dataclasses.dataclass(frozen=True)
+class DataSettings:
+    """What is trained on and what is held out. Without recordings, simulated ones are made."""
+
+    recordings: tuple[str, ...] = ()
+    validation: tuple[str, ...] = ()
+    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+    simulate: SimulateSettings = dataclasses.field(default_factory=SimulateSettings)
+    virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """Everything of a training run."""
+
+    tracer: Mapping[str, Any]
+    optimizer: Mapping[str, Any]
+    baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside it
+    seed: int = 0
+    clip_norm: float = 1.0
+    resume: bool = True  # go on from the run folder's newest checkpoint, if it holds one
+    data: DataSettings = dataclasses.field(default_factory=DataSettings)
+    objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
+    loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)
+    logger: LoggerSettings = dataclasses.field(default_factory=LoggerSettings)
+    scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateConfig:
+    """Everything of an evaluation. What is None is taken from the run."""
+
+    run: str | None = None  # a run folder of experiments.train; without it `tracer` is evaluated untrained
+    checkpoint: int | None = None  # step; the newest if None
+    tracer: Mapping[str, Any] | None = None
+    recordings: tuple[str, ...] = ()
+    epcs: tuple[str, ...] | None = None
+    stride: int | None = None
+    frames: tuple[int, int] | None = None
+    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+    baselines: Mapping[str, Mapping[str, Any]] | None = None
+    virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+    scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
+    progress: bool = True
+
+
+def from_mapping(schema: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
+    """An instance of the dataclass `schema` from plain nested values, lists turned into tuples where a tuple is due.
+
+    Raises `ConfigError` for a key that the schema does not know, one that is missing, or a value of another type.
+    """
+    fields = {field.name: field for field in dataclasses.fields(schema)}  # type: ignore[arg-type]
+    unknown = sorted(set(map(str, values)) - set(fields))
+    if unknown:
+        raise ConfigError(
+            f"{where or schema.__name__}: unknown key {', '.join(map(repr, unknown))}; known are {', '.join(fields)}."
+        )
+    hints = typing.get_type_hints(schema)
+    given = {name: _convert(hints[name], value, f"{where}.{name}".lstrip(".")) for name, value in values.items()}
+    try:
+        return schema(**given)
+    except TypeError as error:
+        raise ConfigError(f"{where or schema.__name__}: {error}.") from error
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    wrong = ConfigError(f"{where}: found {value!r}; expected {getattr(hint, '__name__', str(hint))}.")
+    if hint is Any:
+        return value
+    if origin in (types.UnionType, typing.Union):
+        if value is None:
+            if type(None) in arguments:
+                return None
+            raise wrong
+        return _convert(next(a for a in arguments if a is not type(None)), value, where)
+    if origin is Literal:
+        if value not in arguments:
+            raise ConfigError(f"{where}: found {value!r}; expected one of {', '.join(map(repr, arguments))}.")
+        return value
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        if not isinstance(value, Mapping | hint):
+            raise ConfigError(f"{where}: found {value!r}; expected keys and values.")
+        return from_mapping(hint, value, where=where) if isinstance(value, Mapping) else value
+    if origin is tuple:
+        if isinstance(value, str) or not isinstance(value, Sequence):
+            raise ConfigError(f"{where}: found {value!r}; expected a list.")
+        each = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
+        if len(each) != len(value):
+            raise ConfigError(f"{where}: found {len(value)} elements; expected {len(each)}.")
+        return tuple(
+            _convert(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(zip(each, value, strict=True))
+        )
+    if origin is not None and issubclass(origin, Mapping):
+        if not isinstance(value, Mapping):
+            raise wrong
+        return {str(key): _convert(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise wrong
+    return value
+
+
+def build(settings: Mapping[str, Any], *, where: str = "_target_") -> Any:
+    """Call what `_target_` names with the other keys; nested mappings with a `_target_` are built first.
+
+    Raises `ConfigError` for a target outside this package and Optax, one that does not exist, or wrong arguments.
+    """
+    target = settings.get("_target_")
+    if not isinstance(target, str) or not target.startswith(TARGET_PREFIXES):
+        raise ConfigError(
+            f"{where}: found {target!r}; expected a name that starts with {' or '.join(TARGET_PREFIXES)}."
+        )
+    arguments = {
+        str(key): build(value, where=f"{where}.{key}") if isinstance(value, Mapping) and "_target_" in value else value
+        for key, value in settings.items()
+        if key != "_target_"
+    }
+    called = _resolve(target, where)
+    try:
+        return called(**arguments)
+    except TypeError as error:
+        raise ConfigError(f"{where}: {target} does not take these settings: {error}.") from error
+
+
+def _resolve(target: str, where: str) -> Any:
+    parts = target.split(".")
+    for cut in range(len(parts) - 1, 0, -1):
+        try:
+            module = importlib.import_module(".".join(parts[:cut]))
+        except ModuleNotFoundError:
+            continue
+        if any(part.startswith("_") for part in parts[cut:]):
+            break
+        try:
+            found = functools.reduce(getattr, parts[cut:], module)
+        except AttributeError:
+            break
+        # What a module has merely imported is not its own: no way round the prefixes.
+        owner = getattr(found, "__module__", None) or ""
+        if callable(found) and (owner + ".").startswith(TARGET_PREFIXES):
+            return found
+        break
+    raise ConfigError(f"{where}: there is no {target!r} that can be called; check the spelling.")

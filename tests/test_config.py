@@ -1,0 +1,86 @@
+"""Strict configuration: unknown keys, wrong types, and targets outside the package are refused by name."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import optax
+import pytest
+
+from tagjax import config
+from tagjax.config import ConfigError, DataSettings, EvaluateConfig, TrainConfig, build, from_mapping
+
+LEAST = {"tracer": {"_target_": "tagjax.tagattention.TagAttention"}, "optimizer": {"_target_": "optax.sgd"}}
+
+
+def test_nested_values_reach_their_fields() -> None:
+    given = {**LEAST, "clip_norm": 2, "data": {"recordings": ["a.zarr"], "clips": {"stride": 8, "epcs": None}}}
+    made = from_mapping(TrainConfig, given)
+    assert made.clip_norm == 2.0
+    assert isinstance(made.clip_norm, float)
+    assert made.data.recordings == ("a.zarr",)
+    assert made.data.clips.stride == 8
+    assert made.loop == TrainConfig(**LEAST).loop
+
+
+def test_what_a_schema_holds_survives_the_round_trip() -> None:
+    made = from_mapping(TrainConfig, LEAST)
+    assert from_mapping(TrainConfig, dataclasses.asdict(made)) == made
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"steps": 3}, "unknown key 'steps'"),
+        ({"data": {"clips": {"strid": 3}}}, r"data\.clips: unknown key 'strid'"),
+        ({"seed": "one"}, "seed: found 'one'; expected int"),
+        ({"seed": True}, "seed: found True"),
+        ({"data": {"recordings": "a.zarr"}}, "expected a list"),
+        ({"logger": {"mode": "loud"}}, "expected one of 'disabled', 'offline', 'online'"),
+        ({"data": {"clips": {"stride": None}}}, "data.clips.stride: found None"),
+        ({"data": 3}, "expected keys and values"),
+    ],
+)
+def test_wrong_configuration_names_the_key(given: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        from_mapping(TrainConfig, {**LEAST, **given})
+
+
+def test_missing_keys_and_lengths() -> None:
+    with pytest.raises(ConfigError, match="tracer"):
+        from_mapping(TrainConfig, {"optimizer": LEAST["optimizer"]})
+    assert from_mapping(EvaluateConfig, {"frames": [3, 9]}).frames == (3, 9)
+    with pytest.raises(ConfigError, match="found 3 elements; expected 2"):
+        from_mapping(EvaluateConfig, {"frames": [3, 9, 2]})
+    assert from_mapping(DataSettings, {}) == DataSettings()
+
+
+def test_build_makes_what_the_target_names() -> None:
+    assert isinstance(build({"_target_": "optax.adam", "learning_rate": 0.1}), optax.GradientTransformation)
+    nested = {"_target_": "optax.sgd", "learning_rate": {"_target_": "optax.constant_schedule", "value": 0.2}}
+    assert isinstance(build(nested), optax.GradientTransformation)
+    resting = build({"_target_": "tagjax.config.ClipSettings", "stride": 2})
+    assert resting == config.ClipSettings(stride=2)
+
+
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [
+        ("os.system", "starts with tagjax. or optax."),
+        ("tagjaxevil.thing", "starts with tagjax. or optax."),
+        ("tagjax.recording.dataclasses.asdict", "can be called"),
+        ("tagjax.training.logging.os.system", "can be called"),
+        ("tagjax.config._resolve", "can be called"),
+        ("optax.adamm", "can be called"),
+        ("tagjax.nothing.here", "can be called"),
+        (None, "found None"),
+    ],
+)
+def test_targets_that_are_refused(target: str | None, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build({"_target_": target})
+
+
+def test_unknown_settings_of_a_target_are_refused() -> None:
+    with pytest.raises(ConfigError, match="alhpa"):
+        build({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
