@@ -46,13 +46,16 @@ def clip_gradient(
         return objective(eqx.combine(learnable, rest), camera, frames, key, settings)
 
     values, pull, diagnostics = jax.vjp(terms, learnable, has_aux=True)
-    total = jax.tree.map(jnp.zeros_like, learnable)
+    # One batched pull-back of all terms: compiled once, however many there are.
+    names = list(weights)
+    chosen = {name: jnp.asarray([float(other == name) for other in names], values[name].dtype) for name in names}
+    (gradients,) = jax.vmap(pull)(chosen)
     logged = dict(diagnostics)
-    for name, weight in weights.items():
-        (gradient,) = pull({other: jnp.asarray(float(other == name), values[name].dtype) for other in weights})
-        total = jax.tree.map(lambda sum_, part, w=weight: sum_ + w * part, total, gradient)
+    for number, name in enumerate(names):
         logged[name] = values[name]
-        logged[f"gradient_norm/{name}"] = optax.tree.norm(gradient)
+        logged[f"gradient_norm/{name}"] = optax.tree.norm(jax.tree.map(lambda leaf, n=number: leaf[n], gradients))
+    share = list(weights.values())
+    total = jax.tree.map(lambda leaf: jnp.tensordot(jnp.asarray(share, leaf.dtype), leaf, axes=1), gradients)
     logged["loss"] = sum((weight * values[name] for name, weight in weights.items()), start=jnp.zeros(()))
     return total, logged
 

@@ -1,0 +1,53 @@
+"""Evaluate a training run (or an untrained tracer) on recordings; the last line printed is the result as JSON.
+
+python -m experiments.evaluate run=outputs/train/<time> 'recordings=[c.zarr]'
+python -m experiments.evaluate tracer=tagattention_paper 'recordings=[c.zarr]' 'frames=[0,200]' stride=2
+python -m experiments.evaluate run=<folder> 'recordings=[c.zarr]' virtual_tag.tracks=tracks.csv 'virtual_tag.seeds=[0,1]'
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from .train import CONFIGS, resolved
+
+
+def run_configuration(run: str | None) -> dict[str, Any] | None:
+    """What the run folder's config.yaml says."""
+    if run is None:
+        return None
+    path = Path(run) / "config.yaml"
+    if not path.is_file():
+        raise FileNotFoundError(f"run={run}: there is no {path}; expected a run folder of experiments.train.")
+    config = OmegaConf.load(path)
+    assert isinstance(config, DictConfig)
+    return resolved(config)
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="evaluate")
+def main(config: DictConfig) -> float:
+    from rich.console import Console
+
+    from tagjax.config import EvaluateConfig, from_mapping
+    from tagjax.evaluation.report import plain, score_table
+    from tagjax.evaluation.run import run_evaluation
+
+    values = resolved(config)
+    checked = from_mapping(EvaluateConfig, values)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+    summary = run_evaluation(checked, folder, run_values=run_configuration(checked.run))
+    Console().print(score_table(summary, title=f"report: {folder}"))
+    print(json.dumps(plain(summary), allow_nan=False))
+    first = next(iter(summary.values()))["all"].get("iou")
+    return float("nan") if first is None else float(first)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""A whole training run in a folder: recordings in, checkpoints, logs, and a report on the held-out recordings out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from ..config import ClipSettings, TrainConfig, build
+from ..data.clips import Clip, clip_dataset
+from ..evaluation.evaluate import RecordingResult, ScoreSettings, evaluate_recording
+from ..evaluation.report import score_table, write_json, write_report
+from ..recording import Recording, RecordingError
+from ..tracer import AbstractTracer
+from .checkpoint import Checkpoints
+from .logging import Logger
+from .loop import train
+from .sources import clip_loader, training_recordings
+from .state import TrainState
+from .step import clip_loss, make_optimizer
+
+VALIDATION_CLIPS = 2
+
+
+def make_tracer(settings: Mapping[str, Any]) -> AbstractTracer:
+    """The tracer that the settings name. Raises `ValueError` if they name something else."""
+    tracer = build(settings, where="tracer")
+    if not isinstance(tracer, AbstractTracer):
+        raise ValueError(f"tracer: {settings['_target_']} is no tracer; expected a subclass of AbstractTracer.")
+    return tracer
+
+
+def run_training(config: TrainConfig, folder: Path, *, console: Console | None = None) -> float:
+    """Train as configured, evaluate on the held-out recordings, and return the number a sweep should maximise.
+
+    That number is the mean box IoU on the held-out recordings if they are labelled, else the coherence of the held-out
+    tags' reads with their masks' motion. `folder` then holds checkpoints, metrics.jsonl, metrics.json and report/. An
+    interrupted run leaves a checkpoint, goes on from it when started again in the same folder, and returns NaN.
+    """
+    console = console or Console()
+    clips = config.data.clips
+    training, validation = training_recordings(config.data)
+    _describe(console, training, validation)
+    optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
+    state = TrainState.create(make_tracer(config.tracer), optimizer, seed=config.seed)
+    source = iter(
+        clip_dataset(
+            training,
+            clip_length=clips.length,
+            stride=clips.stride,
+            epcs=clips.epcs,
+            flow=clips.flow,
+            window=clips.window,
+            max_reads=clips.max_reads,
+            seed=config.seed,
+        )
+    )
+    held_out = [clip for recording in validation for clip in validation_clips(recording, clips)]
+    with Checkpoints(folder / "checkpoints") as checkpoints:
+        if checkpoints.steps():
+            if not config.resume:
+                raise RecordingError(f"{folder} holds a run already; set resume=true or choose another folder.")
+            state, data_state = checkpoints.restore(state)
+            source.set_state(data_state)
+            console.print(f"Resumed at step {int(state.step)} of {config.loop.num_steps}.")
+        logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=int(state.step))
+
+        def validate(state: TrainState) -> dict[str, float]:
+            return held_out_numbers(state, held_out, config)
+
+        try:
+            trained = train(
+                state,
+                source,
+                optimizer=optimizer,
+                objective=config.objective,
+                settings=config.loop,
+                logger=logger,
+                checkpoints=checkpoints,
+                validate=validate if held_out else None,
+            )
+        finally:
+            logger.close()
+    if trained.interrupted:
+        console.print(f"Stopped at step {int(trained.state.step)}; go on with hydra.run.dir={folder}")
+        return float("nan")
+    if not validation:
+        console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
+        return float("nan")
+    tracers = {"learned": trained.state.tracer, "untrained": make_tracer(config.tracer)}
+    tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
+    summary = evaluate_tracers(
+        tracers,
+        validation,
+        folder / "report",
+        load=clip_loader(clips),
+        stride=clips.stride,
+        settings=config.scores,
+        epcs=clips.epcs,
+        progress=config.loop.progress,
+    )
+    write_json(folder / "metrics.json", summary)
+    console.print(score_table(summary, title="held-out recordings"))
+    iou = summary["learned"]["all"].get("iou")
+    return float(iou) if iou is not None else validate(trained.state)["own_coherence"]
+
+
+def held_out_numbers(state: TrainState, clips: Sequence[Clip], config: TrainConfig) -> dict[str, float]:
+    """Mean of every term and diagnostic over held-out clips, always with the same random shifts."""
+    key = jax.random.PRNGKey(config.seed)
+    ones = [clip_loss(state.tracer, clip.camera, clip.frames, key, config.objective) for clip in clips]
+    return {name: float(np.mean([float(one[name]) for one in ones])) for name in ones[0]}
+
+
+def validation_clips(recording: Recording, settings: ClipSettings) -> list[Clip]:
+    """A few clips spread over a recording, of the training clips' length (or shorter, if it is)."""
+    length = min(settings.length, recording.num_frames)
+    starts = np.linspace(0, recording.num_frames - length, VALIDATION_CLIPS).astype(int)
+    load = clip_loader(settings)
+    return [load(recording, int(start), int(start) + length) for start in sorted(set(starts.tolist()))]
+
+
+def evaluate_tracers(
+    tracers: Mapping[str, AbstractTracer],
+    recordings: Sequence[Recording],
+    folder: Path,
+    *,
+    load: Callable[..., Clip],
+    stride: int,
+    settings: ScoreSettings,
+    epcs: Sequence[str] | None = None,
+    frames: tuple[int, int] | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Run each tracer over each recording, write the report into `folder` and return its summary."""
+    work = [(name, number) for name in tracers for number in range(len(recordings))]
+    results: dict[str, list[RecordingResult]] = {name: [] for name in tracers}
+    for name, number in track(work, description="evaluate", disable=not progress):
+        results[name].append(
+            evaluate_recording(
+                tracers[name], recordings[number], load, stride=stride, epcs=epcs, settings=settings, frames=frames
+            )
+        )
+    return write_report(folder, results)
+
+
+def _describe(console: Console, training: Sequence[Recording], validation: Sequence[Recording]) -> None:
+    for kind, recordings in (("train", training), ("held out", validation)):
+        for recording in recordings:
+            tags = len(recording.reads.epcs)
+            console.print(
+                f"{kind}: {recording.name}, {recording.num_frames} frames at {recording.frame_rate_hz:.1f}/s, "
+                f"{recording.reads.num_reads} reads of {tags} tags"
+            )

@@ -1,0 +1,130 @@
+"""Where recordings come from: stores, the simulator, and virtual tags put on recordings with known tracks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..config import ClipSettings, DataSettings, SimulateSettings, VirtualTagSettings
+from ..data.clips import Clip, load_clip
+from ..data.store import open_recording, save_recording
+from ..recording import Recording, RecordingError, TagReads, Truth
+
+
+def clip_loader(settings: ClipSettings) -> Callable[..., Clip]:
+    """`load(recording, start, stop, epcs=...)` with the settings filled in."""
+
+    def load(recording: Recording, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Clip:
+        return load_clip(
+            recording,
+            start,
+            stop,
+            stride=settings.stride,
+            epcs=settings.epcs if epcs is None else epcs,
+            flow=settings.flow,
+            window=settings.window,
+            max_reads=settings.max_reads,
+        )
+
+    return load
+
+
+def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recording]]:
+    """Recordings to train on and held-out ones: those named, or simulated ones where none is named.
+
+    Raises `RecordingError` for recordings that cannot be used, or that are in both.
+    """
+    twice = set(data.recordings) & set(data.validation)
+    if twice:
+        raise RecordingError(f"{', '.join(sorted(twice))}: named both for training and for validation; hold it out.")
+    if not data.recordings:
+        return simulated_recordings(data.simulate)
+    tag = data.virtual_tag
+    return tuple(
+        [with_virtual_tags(open_recording(path), tag) for path in paths] for paths in (data.recordings, data.validation)
+    )  # type: ignore[return-value]
+
+
+def simulated_recordings(settings: SimulateSettings) -> tuple[list[Recording], list[Recording]]:
+    """Simulated recordings, made once and kept: the second call only opens them. Needs the sim extra."""
+    training = [_simulated(settings, settings.seed + number) for number in range(settings.num_recordings)]
+    return training, [_simulated(settings, settings.validation_seed)]
+
+
+def _simulated(settings: SimulateSettings, seed: int) -> Recording:
+    path = Path(settings.folder) / f"simulated-{settings.num_frames}frames-seed{seed}.zarr"
+    if not path.exists():
+        from ..sim.session import simulate_recording
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_recording(simulate_recording(num_frames=settings.num_frames, seed=seed), path)
+    return open_recording(path)
+
+
+def with_virtual_tags(recording: Recording, settings: VirtualTagSettings) -> Recording:
+    """The recording with a virtual tag on each tracked label, for each seed, read as if it were alone.
+
+    Unchanged if no tracks are given.
+    """
+    if settings.tracks is None:
+        return recording
+    from ..sim.reader import ReaderSettings
+    from ..sim.virtual_tag import attach_virtual_tags, load_tracks_csv
+
+    if settings.labels is not None:
+        recording = dataclasses.replace(recording, truth=_labelled(recording, Path(settings.labels)))
+    tracks = load_tracks_csv(settings.tracks, recording.frame_time_s())
+    reader = ReaderSettings(**settings.reader)
+    tagged = [
+        attach_virtual_tags(
+            recording, {label: track}, reader, seed=seed, epc_of=lambda one, s=seed: f"label{one}-seed{s}"
+        )
+        for seed in settings.seeds
+        for label, track in tracks.items()
+    ]
+    return dataclasses.replace(
+        recording,
+        reads=join_reads([one.reads for one in tagged]),
+        truth=_joined_truth([one.truth for one in tagged if one.truth is not None]),
+    )
+
+
+def join_reads(parts: Sequence[TagReads]) -> TagReads:
+    """The reads of several tables in order of time. Their phase convention must be the same."""
+    first = parts[0]
+    for part in parts[1:]:
+        if (part.phase_period_rad, part.phase_sign) != (first.phase_period_rad, first.phase_sign):
+            raise RecordingError("Reads of differing phase period or sign cannot be put into one table; convert first.")
+    columns = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in dataclasses.fields(first)
+        if all(isinstance(getattr(part, field.name), np.ndarray) for part in parts)
+    }
+    return dataclasses.replace(first, **columns)[np.argsort(columns["time_ns"], kind="stable")]
+
+
+def _joined_truth(parts: Sequence[Truth]) -> Truth:
+    joined: dict[str, Any] = {}
+    for name in ("tag_to_label", "tag_range_m", "tag_position_m", "visible"):
+        joined[name] = {key: value for part in parts for key, value in getattr(part, name).items()}
+    return dataclasses.replace(parts[0], **joined)
+
+
+def _labelled(recording: Recording, folder: Path) -> Truth:
+    """The recording's truth with label masks read from a folder of PNG files, one a frame in order of name."""
+    files = sorted(folder.glob("*.png"))
+    if len(files) != recording.num_frames:
+        raise RecordingError(
+            f"{folder}: {len(files)} PNG files; expected {recording.num_frames}, one a frame of {recording.name}."
+        )
+    masks = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
+    for file, mask in zip(files, masks, strict=True):
+        if mask is None or mask.shape != recording.image_shape:
+            found = "unreadable" if mask is None else mask.shape
+            raise RecordingError(f"{file}: {found}; expected a grey picture of {recording.image_shape}.")
+    return dataclasses.replace(recording.truth or Truth(), labels=np.stack(masks))  # type: ignore[arg-type]

@@ -1,0 +1,62 @@
+"""Every configuration under conf/ composes, fits its schema, and names things that exist."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import optax
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf
+
+from tagjax.config import EvaluateConfig, TrainConfig, build, from_mapping
+from tagjax.tagattention import TagAttention
+from tagjax.tracer import AbstractTracer
+
+CONF = Path(__file__).parents[1] / "conf"
+
+
+def _compose(name: str, *overrides: str) -> Any:
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
+
+
+GROUPS = ("data", "tracer", "optimizer", "objective", "logger", "experiment", "debug")
+
+
+def _options(group: str) -> list[str]:
+    return [f"{group}={path.stem}" for path in sorted((CONF / group).glob("*.yaml"))]
+
+
+@pytest.mark.parametrize(
+    "override",
+    [option for group in GROUPS for option in _options(group)],
+)
+def test_every_training_configuration_is_valid(override: str) -> None:
+    config = from_mapping(TrainConfig, _compose("train", override))
+    assert isinstance(build(config.tracer), AbstractTracer)
+    assert isinstance(build(config.optimizer), optax.GradientTransformation)
+    for settings in config.baselines.values():
+        assert isinstance(build(settings), AbstractTracer)
+    assert config.objective.weights()
+
+
+def test_evaluation_configurations_are_valid() -> None:
+    assert from_mapping(EvaluateConfig, _compose("evaluate")).tracer is None
+    named = from_mapping(EvaluateConfig, _compose("evaluate", "tracer=tagattention_paper", "frames=[0,20]"))
+    assert named.tracer is not None
+    assert isinstance(build(named.tracer), AbstractTracer)
+    assert named.frames == (0, 20)
+
+
+def test_a_misspelt_override_is_refused() -> None:
+    with pytest.raises(ConfigCompositionException):
+        _compose("train", "loop.num_step=3")
+
+
+def test_the_tracer_file_names_every_setting() -> None:
+    given = set(_compose("train")["tracer"]) - {"_target_"}
+    assert given == set(inspect.signature(TagAttention).parameters)
