@@ -42,7 +42,7 @@ def _clip(length: int = 20) -> synthetic.SyntheticClip:
 
 def test_clip_reads_hold_each_read_once() -> None:
     recording = synthetic.recording(40)
-    reads = clip_reads(synthetic.load(recording, 5, 25).frames, SETTINGS)
+    reads = eqx.filter_jit(clip_reads)(synthetic.load(recording, 5, 25).frames, SETTINGS)
     time_s = recording.frame_time_s()
     for tag, epc in enumerate(recording.reads.epcs):
         own = recording.reads.select(epc)
@@ -78,14 +78,15 @@ def _said_with_true_steps(clip: synthetic.SyntheticClip):
 
 def test_true_motion_explains_own_reads_and_no_others() -> None:
     seen = _said_with_true_steps(_clip())
-    found = agreement(seen, SETTINGS, KEY)
+    found = eqx.filter_jit(agreement)(seen, SETTINGS, KEY)
     own = np.asarray(jnp.einsum("iip->ip", found.between))
     assert own.min() > 0.97  # noise-free reads; what is left is the curvature between frames
     assert np.asarray(found.between[0, 1]).mean() < 0.8
     assert np.asarray(found.still).mean() < 0.8
-    loss, numbers = contrast(seen, SETTINGS, KEY)
+    judge = eqx.filter_jit(contrast)
+    loss, numbers = judge(seen, SETTINGS, KEY)
     shuffled = eqx.tree_at(lambda s: s.said.step_m, seen, seen.said.step_m[:, ::-1])
-    assert float(contrast(shuffled, SETTINGS, KEY)[0]) > float(loss) + 1.0
+    assert float(judge(shuffled, SETTINGS, KEY)[0]) > float(loss) + 1.0
     assert float(numbers["own_wins"]) == pytest.approx(1.0)
 
 
@@ -99,7 +100,7 @@ def test_reads_of_a_resting_tag_have_no_say() -> None:
 
 def test_future_agreement_outlines_the_moving_object() -> None:
     clip = _clip()
-    agrees, valid, weight = future_agreement(clip.camera, clip.frames, SETTINGS)
+    agrees, valid, weight = eqx.filter_jit(future_agreement)(clip.camera, clip.frames, SETTINGS)
     assert bool(valid.all())
     labels = np.asarray(synthetic.recording(1).truth.labels[0])  # type: ignore[union-attr, index]
     for tag, label in enumerate((1, 2)):
@@ -128,6 +129,7 @@ def test_gradient_agrees_with_finite_differences() -> None:
         )
         tracer = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), synthetic.SmallTracer(60.0, 1.0))
 
+        @jax.jit
         def loss(level: jax.Array) -> jax.Array:
             moved = eqx.tree_at(lambda t: t.level, tracer, level)
             terms, _ = objective(moved, clip.camera, clip.frames, KEY, SETTINGS)

@@ -149,17 +149,17 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
     columns = {
         "iou": "IoU",
         "cle_px": "CLE px",
-        "mask_j": "mask J",
-        "identification": "identified",
+        "mask_j": "J",
+        "identification": "named",
         "found": "found",
         "locked": "locked",
         "time_to_lock_s": "lock s",
         "num_frames": "frames",
     }
     table = Table(title=title)
-    table.add_column("tracer")
+    table.add_column("tracer", no_wrap=True)
     for heading in columns.values():
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True, min_width=len(heading))
     for tracer, scores in summary.items():
         values = [scores["all"].get(name) for name in columns]
         table.add_row(tracer, *("-" if v is None else f"{v:d}" if isinstance(v, int) else f"{v:.3g}" for v in values))

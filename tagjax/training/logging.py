@@ -65,7 +65,7 @@ class Logger:
 
     def close(self) -> None:
         if self._run is not None:
-            self._run.finish(quiet=True)
+            self._run.finish()
 
 
 def _open_wandb(folder: Path, settings: LoggerSettings, config: Mapping[str, Any]) -> Any:

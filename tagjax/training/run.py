@@ -95,6 +95,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
         return float("nan")
     tracers = {"learned": trained.state.tracer, "untrained": make_tracer(config.tracer)}
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
+    write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
     summary = evaluate_tracers(
         tracers,
         validation,
@@ -109,6 +110,14 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     console.print(score_table(summary, title="held-out recordings"))
     iou = summary["learned"]["all"].get("iou")
     return float(iou) if iou is not None else validate(trained.state)["own_coherence"]
+
+
+def parameters(tracer: AbstractTracer) -> dict[str, float]:
+    """The tracer's scalar parameters by name, in physical units where it can tell them (`physical`)."""
+    physical = getattr(tracer, "physical", None)
+    if physical is not None:
+        return dict(physical())
+    return {name: float(leaf) for name, leaf in vars(tracer).items() if isinstance(leaf, jax.Array) and leaf.ndim == 0}
 
 
 def held_out_numbers(state: TrainState, clips: Sequence[Clip], config: TrainConfig) -> dict[str, float]:
