@@ -46,7 +46,7 @@ def score_curves(
     upper.set(ylabel="box IoU", ylim=(-0.02, 1.02), title=title)
     lower.set(ylabel="CLE (px of 512)", xlabel="frame number (shaded: not scored)")
     lower.set_ylim(bottom=0)
-    upper.legend(loc="upper right", fontsize=8)
+    upper.legend(loc="lower right", fontsize=8, ncols=4)
     figure.savefig(path, dpi=110)
 
 
