@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-_FAR = 1e6
+_FAR = 1e30
 
 
 class Segments(eqx.Module):
@@ -147,10 +147,10 @@ def segment_affinity(
     near = jnp.stack(
         _shifted(jnp.concatenate([centre_m, step_m[..., None], alive.astype(step_m.dtype)[..., None]], axis=-1), 0.0)
     )
-    apart = jnp.sum(jnp.square(near[..., :3] - centre_m), axis=-1) / (2.0 * length_m**2)
-    unlike = jnp.square(near[..., 3] - step_m) / (2.0 * step_scale_m**2)
-    raw = jnp.where((near[..., 4] > 0.5) & alive, jnp.exp(-apart - unlike), 0.0)
-    return raw / jnp.maximum(jnp.sum(raw, axis=0), 1e-6)
+    apart = jnp.sum(jnp.square(near[..., :3] - centre_m[None]), axis=-1) / (2.0 * length_m**2)
+    unlike = jnp.square(near[..., 3] - step_m[None]) / (2.0 * step_scale_m**2)
+    raw = jnp.where((near[..., 4] > 0.5) & alive[None], jnp.exp(-apart - unlike), 0.0)
+    return raw / jnp.maximum(jnp.sum(raw, axis=0, keepdims=True), 1e-6)
 
 
 def min_max(value: Float[Array, "height width"], valid: Bool[Array, "height width"]) -> Float[Array, "height width"]:
@@ -172,9 +172,10 @@ def cdf_corner(
 ) -> Float[Array, ""]:
     """The last corner of the CDF of normalised probabilities (III.G, Fig. 6): where to cut the object out.
 
-    A corner is a bin at which the slope of the CDF rises by more than `significance` (a share of the pixels); pixels
-    are binned linearly, so the corner moves smoothly with them. The last corner is taken softly,
-    w_i = s_i prod_{j > i} (1 - s_j) with s = sigmoid((rise - significance) / width), which is hard as width -> 0.
+    A corner is a bin at which the CDF leaves a flat stretch: its slope (the share of the pixels in a bin) is below
+    `significance` and rises by more than that in the next bin. Pixels are binned linearly, so the corner moves
+    smoothly with them. The last corner is taken softly, w_i = s_i prod_{j > i} (1 - s_j) with s the product of
+    sigmoid((significance - slope) / width) and sigmoid((rise - significance) / width): hard as width -> 0.
     Without any corner the cut is 0.5.
     """
     position = jnp.clip(probability, 0.0, 1.0) * (num_bins - 1)
@@ -190,10 +191,11 @@ def cdf_corner(
         .add((share * known).reshape(-1))
     ) / jnp.maximum(jnp.sum(known), 1.0)
     rise = histogram[1:] - histogram[:-1]
-    score = jax.nn.sigmoid((rise - significance) / width)
+    flat = jax.nn.sigmoid((significance - histogram[:-1]) / width)
+    score = flat * jax.nn.sigmoid((rise - significance) / width)
     later = jnp.flip(jnp.cumprod(jnp.flip(1.0 - score)))
     weight = score * jnp.concatenate([later[1:], jnp.ones(1)])
-    edges = (jnp.arange(num_bins - 1) + 0.5) / (num_bins - 1)
+    edges = (jnp.arange(num_bins - 1, dtype=probability.dtype) + 0.5) / (num_bins - 1)
     return jnp.sum(weight * edges) + (1.0 - jnp.sum(weight)) * 0.5
 
 
@@ -208,7 +210,7 @@ def mean_shift(
     """The mode of weighted points next to `start_m`: Gaussian mean shift; the start where no weight is near."""
 
     def shift(centre: Float[Array, " 3"], _: None):
-        kernel = weight * jnp.exp(-jnp.sum(jnp.square(points_m - centre), axis=-1) / (2.0 * bandwidth_m**2))
+        kernel = weight * jnp.exp(-jnp.sum(jnp.square(points_m - centre[None, None]), axis=-1) / (2.0 * bandwidth_m**2))
         total = jnp.sum(kernel)
         mean = jnp.sum(points_m * kernel[..., None], axis=(0, 1)) / jnp.maximum(total, 1e-6)
         return jnp.where(total > 1e-6, mean, centre), None

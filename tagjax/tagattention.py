@@ -186,7 +186,7 @@ class TagAttention(AbstractTracer):
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
         points = camera.rays * frame.depth_m[..., None]
         valid = frame.depth_m > 0
-        distance = jnp.where(valid, safe_norm(points - camera.antenna_m), 0.0)
+        distance = jnp.where(valid, safe_norm(points - camera.antenna_m[None, None]), 0.0)
         time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
         elapsed_s = jnp.maximum(time_s[-1] - time_s[-2], 1e-3)
         motion = push_gather(state.motion, frame.backward_px, distance, self.max_speed_m_s * elapsed_s + 0.05)
@@ -291,7 +291,9 @@ class TagAttention(AbstractTracer):
         confidence: Float[Array, ""],
     ) -> tuple[Float[Array, "height width"], Float[Array, " 3"]]:
         """The soft mask, and the object's centre: log odds with the place prior, cut, kept to one compact thing."""
-        away = jnp.sum(jnp.square(points - predicted_m), axis=-1) / (2.0 * jnp.exp(2.0 * self.log_prior_radius))
+        away = jnp.sum(jnp.square(points - predicted_m[None, None]), axis=-1) / (
+            2.0 * jnp.exp(2.0 * self.log_prior_radius)
+        )
         prior = jnp.exp(self.log_prior_weight) * confidence * (2.0 * jnp.exp(-away) - 1.0)
         total = log_odds + prior
         best = jnp.max(jnp.where(valid, total, -1e3))
@@ -302,7 +304,7 @@ class TagAttention(AbstractTracer):
         start = jnp.sum(points * peak[..., None], axis=(0, 1)) / jnp.maximum(jnp.sum(peak), 1e-6)
         extent = jnp.exp(self.log_extent)
         centre = mean_shift(points, weight, start, extent)
-        spread = jnp.sum(jnp.square(points - centre), axis=-1) / (2.0 * extent**2)
+        spread = jnp.sum(jnp.square(points - centre[None, None]), axis=-1) / (2.0 * extent**2)
         return jax.nn.sigmoid((total - threshold - spread) / width) * valid, centre
 
 

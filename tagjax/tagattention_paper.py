@@ -56,7 +56,7 @@ class TagAttentionPaper(AbstractTracer):
     def step(self, camera: Camera, state: PaperState, frame: Frame) -> tuple[PaperState, Trace]:
         points = camera.rays * frame.depth_m[..., None]
         valid = frame.depth_m > 0
-        distance = jnp.where(valid, safe_norm(points - camera.antenna_m), 0.0)
+        distance = jnp.where(valid, safe_norm(points - camera.antenna_m[None, None]), 0.0)
         time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
         motion = push_splat(state.motion, frame.forward_px, distance)
         rho = centre_first(motion.distance_m, motion.valid)
@@ -73,9 +73,7 @@ class TagAttentionPaper(AbstractTracer):
             att = attention(
                 att_rbf(rho, rd, motion.valid, self.alpha_m2[None, None]), att_corr(rho, rd, motion.valid), self.beta
             )
-            evidence = log_likelihood_ratio(
-                jnp.where(full, att, 0.0), jnp.ones(()), jnp.asarray(FLOOR)
-            )
+            evidence = log_likelihood_ratio(jnp.where(full, att, 0.0), jnp.ones(()), jnp.asarray(FLOOR))
             known = jnp.all(jnp.isfinite(radio.std_m))
             gate = velocity_gate(radio_speed(radio.relative_m, time_s), self.v0_m_s, 0.1 * width) * known
             likelihood = propagate(carried, evidence, gate, self.forgetting)

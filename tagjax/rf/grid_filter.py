@@ -81,10 +81,11 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
         time, angle, carrier, concentration, channel, valid = read
         gap = jnp.where(started, jnp.maximum(time - last_time, 0.0), 0.0)
         turned = jnp.fft.rfft(belief, axis=0)
-        turn = jnp.exp(-1j * harmonic[:, None] * (wavenumber * gap * velocity)[None, :])
+        turned_by = harmonic[:, None] * (wavenumber * gap * velocity)[None, :]
+        turn = jax.lax.complex(jnp.cos(turned_by), -jnp.sin(turned_by))
         blur = jnp.where((channel != last_channel) & started, model.hop_rad, 0.0)
         damp = jnp.exp(-0.5 * jnp.square(harmonic * blur))[:, None]
-        predicted = jnp.fft.irfft(turned * turn * damp, n=num_phases, axis=0)
+        predicted = jnp.fft.irfft(turned * turn * damp.astype(turned.dtype), n=num_phases, axis=0)
         spread = jnp.exp(-0.5 * model.velocity_walk_m2_s3 * gap * decay)
         predicted = jnp.maximum(((predicted @ basis.T) * spread[None, :]) @ basis, 0.0) + 1e-9
         mean_velocity = jnp.sum(predicted * velocity[None, :]) / jnp.sum(predicted)

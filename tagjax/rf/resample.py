@@ -32,7 +32,8 @@ def resample_polynomial(
     t, y = time_s[index], value[index]
     own = jnp.eye(order + 1, dtype=bool)[None]
     pair = ~own & member[:, None, :] & member[:, :, None]
-    ratio = safe_divide(query_s[:, None, None] - t[:, None, :], t[:, :, None] - t[:, None, :])
+    apart = t[:, :, None] - t[:, None, :]
+    ratio = safe_divide(jnp.broadcast_to(query_s[:, None, None] - t[:, None, :], apart.shape), apart)
     basis = jnp.prod(jnp.where(pair, ratio, 1.0), axis=-1)
     out = jnp.sum(jnp.where(member, basis * y, 0.0), axis=-1)
     last = value[jnp.maximum(count - 1, 0)]

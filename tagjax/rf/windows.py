@@ -45,7 +45,7 @@ def phase_reads(reads: TagReads, epc: str, origin_ns: int, *, length: int | None
     pairs, channel = np.unique(np.stack([own.antenna, own.carrier_hz]), axis=1, return_inverse=True)
     del pairs
 
-    def padded(column: np.ndarray, fill: float, dtype: type) -> Array:
+    def padded(column: np.ndarray, fill: float | int, dtype: type) -> Array:
         out = np.full(size, fill, dtype)
         out[:count] = column
         return jnp.asarray(out)

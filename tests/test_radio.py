@@ -1,0 +1,335 @@
+"""The radio side: closed forms, the paper's rules, and the robust estimator against simulated and real reads."""
+
+import csv
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from radio_simulation import C, simulate_reads, smooth_path
+from scipy.interpolate import lagrange
+
+from tagjax.recording import TagReads
+from tagjax.rf.channels import estimate_slope
+from tagjax.rf.coherence import coherence, phase_residual
+from tagjax.rf.grid_filter import RadioModel, filter_reads, reference_carrier
+from tagjax.rf.noise import pi_flip_share, thermal_sigma_rad
+from tagjax.rf.phase import distance_to_phase, phase_to_distance
+from tagjax.rf.reads import PhaseReads
+from tagjax.rf.refine import interpolation_weights, refine_path
+from tagjax.rf.resample import resample_polynomial
+from tagjax.rf.unwrap import remove_jump, unwrap_paper
+from tagjax.rf.windows import paper_windows, phase_reads, radio_model, radio_windows, window_reads
+
+
+def _steps(window, truth):
+    ok = np.isfinite(np.asarray(window.std_m)).all(axis=1)
+    ok[:10] = False
+    index = np.maximum(np.arange(len(truth))[:, None] - np.arange(4, -1, -1), 0)
+    expected = truth[index] - truth[index[:, :1]]
+    error = np.diff(np.asarray(window.relative_m) - expected, axis=1)[:, -1]
+    return error, ok
+
+
+def _buffer(time_s, phase_rad, carrier_hz=920e6, channel=0, sigma_rad=0.05):
+    count = len(time_s)
+    return PhaseReads(
+        time_s=jnp.asarray(time_s, jnp.float32),
+        phase_rad=jnp.asarray(np.mod(phase_rad, 2 * np.pi), jnp.float32),
+        carrier_hz=jnp.full(count, carrier_hz, jnp.float32),
+        sigma_rad=jnp.full(count, sigma_rad, jnp.float32),
+        channel=jnp.broadcast_to(jnp.asarray(channel, jnp.int32), (count,)),
+        valid=jnp.ones(count, bool),
+    )
+
+
+def test_half_a_wavelength_is_one_turn():
+    carrier = jnp.asarray(920e6)
+    np.testing.assert_allclose(distance_to_phase(C / carrier / 2, carrier), 2 * np.pi, rtol=1e-6)
+    np.testing.assert_allclose(phase_to_distance(distance_to_phase(jnp.asarray(1.7), carrier), carrier), 1.7, rtol=1e-6)
+
+
+def test_noise_follows_the_measured_table():
+    np.testing.assert_allclose(thermal_sigma_rad(np.array([-55.0, -65.0, -70.0])), [0.031, 0.074, 0.114], rtol=0.15)
+
+
+def test_flip_share_is_found():
+    rng = np.random.default_rng(0)
+    time_s = np.arange(4000) * 0.02
+    for share in (0.0, 0.05, 0.2):
+        phase = np.mod(0.3 + rng.normal(0, 0.05, 4000) + np.pi * (rng.random(4000) < share), 2 * np.pi)
+        assert abs(pi_flip_share(phase, time_s, np.zeros(4000)) - share) < 0.02
+    assert np.isnan(pi_flip_share(np.zeros(3), np.arange(3.0), np.zeros(3)))
+
+
+def test_channel_slope_is_found_through_flips_and_motion():
+    rng = np.random.default_rng(1)
+    reads = phase_reads(simulate_reads(rng, smooth_path(rng, 1.0, 15), 15), "A", 0)
+    valid = np.asarray(reads.valid)
+    columns = [np.asarray(c)[valid] for c in (reads.phase_rad, reads.time_s, reads.channel, reads.carrier_hz)]
+    slope = estimate_slope(*columns)
+    # The path of about 2 to 4 m adds 4 pi d / c = 0.08 to 0.17 rad/MHz to the device's 0.42.
+    assert 0.42e-6 < slope.slope_rad_hz < 0.65e-6
+    assert slope.residual_rad < 0.4
+
+
+@pytest.mark.parametrize(
+    ("step", "expected"), [(0.4, 0.4), (0.6, -0.4), (-0.6, 0.4), (1.4, 0.4), (1.6, -0.4), (-1.9, 0.1)]
+)
+def test_jumps_go_by_the_papers_thresholds(step, expected):
+    np.testing.assert_allclose(remove_jump(jnp.asarray(step * np.pi)), expected * np.pi, rtol=1e-5)
+
+
+def test_paper_unwrapping_follows_a_slow_walk_exactly():
+    time_s = np.arange(200) * 0.02
+    distance = 1.5 + 0.3 * time_s
+    reads = _buffer(time_s, 4 * np.pi * 920e6 / C * distance)
+    np.testing.assert_allclose(unwrap_paper(reads), distance - distance[0], atol=2e-4)
+
+
+def test_paper_unwrapping_keeps_the_velocity_over_an_impossible_step():
+    time_s = np.arange(10) * 0.02
+    phase = 4 * np.pi * 920e6 / C * 0.3 * time_s
+    phase[6:] += 0.45 * np.pi
+    out = np.asarray(unwrap_paper(_buffer(time_s, phase)))
+    # The jump is refused, and so is the step after it, whose velocity differs as much from the jump's.
+    np.testing.assert_allclose(np.diff(out), 0.3 * 0.02, rtol=2e-2)
+
+
+def test_paper_unwrapping_holds_at_a_channel_change():
+    reads = _buffer([0.0, 0.02, 0.04], [0.1, 0.2, 1.5], channel=np.array([0, 0, 1]))
+    out = np.asarray(unwrap_paper(reads))
+    assert out[2] == out[1]
+
+
+def test_polynomial_resampling_is_lagrange():
+    rng = np.random.default_rng(0)
+    time_s, value = np.sort(rng.uniform(0, 1, 12)), rng.normal(size=12)
+    query = np.array([0.5 * (time_s[5] + time_s[6])])
+    expected = lagrange(time_s[4:8] - time_s[4], value[4:8])(query - time_s[4])
+    padded_t = jnp.asarray(np.pad(time_s, (0, 4), constant_values=time_s[-1]), jnp.float32)
+    padded_v = jnp.asarray(np.pad(value, (0, 4), constant_values=99.0), jnp.float32)
+    out, inside = resample_polynomial(padded_t, padded_v, jnp.asarray(12.0), jnp.asarray(query, jnp.float32))
+    np.testing.assert_allclose(out, expected, rtol=2e-3)
+    assert bool(inside.all())
+    _, outside = resample_polynomial(padded_t, padded_v, jnp.asarray(12.0), jnp.asarray([-1.0, 2.0]))
+    assert not outside.any()
+
+
+def test_coherence_is_1_for_the_true_distance_whatever_the_channel_offsets():
+    rng = np.random.default_rng(0)
+    time_s = np.sort(rng.uniform(0, 1, 60))
+    channel = jnp.asarray(rng.integers(0, 4, 60))
+    carrier = 920e6 + 0.5e6 * np.asarray(channel)
+    distance = 2 + 0.8 * time_s
+    offsets = rng.uniform(0, 6, 4)
+    flips = np.pi * (rng.random(60) < 0.3)
+    phase = jnp.asarray(4 * np.pi * carrier * distance / C + offsets[channel] + flips)
+    args = (jnp.ones(60), channel)
+    carrier = jnp.asarray(carrier, jnp.float32)
+    with jax.enable_x64(True):
+        exact = phase_residual(phase, jnp.asarray(carrier, phase.dtype), jnp.asarray(distance, phase.dtype))
+        exact = jnp.asarray(exact, jnp.float32)
+    np.testing.assert_allclose(coherence(exact, *args, num_channels=4, multiple=2), 1.0, atol=1e-4)
+    still = phase_residual(jnp.asarray(phase, jnp.float32), carrier, jnp.full(60, 2.0))
+    assert float(coherence(still, *args, num_channels=4, multiple=2)) < 0.5
+    assert float(coherence(still, jnp.zeros(60), channel, num_channels=4)) == 0.0
+
+
+def test_coherence_gradient_agrees_with_finite_differences(gradients_agree):
+    rng = np.random.default_rng(0)
+    channel = jnp.asarray(rng.integers(0, 3, 20))
+    weight = rng.uniform(0.5, 1, 20)
+    gradients_agree(lambda r, w: coherence(r, w, channel, num_channels=3, multiple=2), (rng.uniform(0, 6, 20), weight))
+
+
+def test_filter_follows_a_clean_ramp_through_flips_and_hops():
+    rng = np.random.default_rng(0)
+    reads = phase_reads(simulate_reads(rng, lambda t: 2 + 0.7 * t, 6.0, reflector=0.0, sigma_rad=0.03), "A", 0)
+    path = filter_reads(reads, radio_model(reads))
+    valid = np.asarray(reads.valid)
+    error = np.asarray(path.distance_m)[valid] - 0.7 * np.asarray(reads.time_s)[valid]
+    assert np.ptp(error[20:]) < 0.02
+    np.testing.assert_allclose(np.asarray(path.velocity_m_s)[valid][30:].mean(), 0.7, atol=0.03)
+
+
+def test_refinement_is_the_weighted_least_squares_fit_where_nothing_wraps():
+    rng = np.random.default_rng(0)
+    time_s = np.linspace(0, 0.4, 40)
+    truth = np.array([0.0, 0.01, 0.025, 0.03, 0.028])
+    knots = np.linspace(0, 0.4, 5)
+    model = RadioModel(multipath_rad=0.0, acceleration_m_s2=1e3)
+    weights = np.asarray(interpolation_weights(jnp.asarray(time_s, jnp.float32), jnp.asarray(knots, jnp.float32)))
+    wave = 4 * np.pi * 920e6 / C
+    phase = wave * weights @ truth + 0.4 + rng.normal(0, 0.01, 40)
+    reads = _buffer(time_s, phase, sigma_rad=0.05)
+    refined = refine_path(
+        reads,
+        jnp.asarray(knots, jnp.float32),
+        jnp.asarray(0.9 * truth + 0.003, jnp.float32),
+        reference_carrier(reads),
+        model,
+        max_steps=40,
+    )
+    design = np.concatenate([wave * weights[:, 1:], np.ones((40, 1))], axis=1)
+    expected = np.linalg.lstsq(design, phase, rcond=None)[0]
+    np.testing.assert_allclose(refined.relative_m[1:], expected[:-1], atol=2e-4)
+    covariance = np.linalg.inv(design.T @ design) * 0.05**2
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(np.asarray(refined.covariance_m2)))[1:], np.sqrt(np.diag(covariance))[:-1], rtol=0.1
+    )
+
+
+def test_refinement_differentiates_implicitly():
+    time_s = np.linspace(0, 0.4, 30)
+    phase = 4 * np.pi * 920e6 / C * 0.3 * time_s + 0.02 * np.sin(40 * time_s)
+    knots = jnp.linspace(0, 0.4, 5)
+
+    def end(multipath):
+        reads = _buffer(time_s, phase)
+        model = RadioModel(multipath_rad=multipath, acceleration_m_s2=0.05)
+        return refine_path(reads, knots, 0.3 * knots, reference_carrier(reads), model, max_steps=30).relative_m[2]
+
+    exact = float(jax.grad(end)(jnp.asarray(0.15)))
+    numeric = float(end(jnp.asarray(0.17)) - end(jnp.asarray(0.13))) / 0.04
+    assert np.isfinite(exact)
+    np.testing.assert_allclose(exact, numeric, rtol=0.1, atol=1e-5)
+
+
+def test_robust_steps_have_at_most_a_third_of_the_papers_error():
+    """45 reads/s, 5 % pi flips, a reflector, hopping, up to 1.5 m/s, 30 frames/s; five recordings together."""
+    errors = {"robust": [], "paper": []}
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        path = smooth_path(rng, 1.5, 10)
+        reads = phase_reads(simulate_reads(rng, path, 10), "A", 0)
+        frames = np.arange(300) / 30
+        steps = {
+            name: _steps(radio_windows(reads, jnp.asarray(frames, jnp.float32), 5, name), path(frames))
+            for name in errors
+        }
+        both = steps["robust"][1] & steps["paper"][1]
+        assert both.mean() > 0.9
+        for name, (error, _) in steps.items():
+            errors[name].append(error[both])
+    rms = {name: np.sqrt(np.mean(np.concatenate(parts) ** 2)) for name, parts in errors.items()}
+    assert rms["robust"] <= rms["paper"] / 3
+
+
+def test_twelve_tags_at_15_reads_a_second_stay_usable_at_walking_pace():
+    errors, moves = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        path = smooth_path(rng, 0.6, 10)
+        reads = phase_reads(simulate_reads(rng, path, 10, rate_hz=15.0), "A", 0)
+        frames = np.arange(300) / 30
+        error, ok = _steps(radio_windows(reads, jnp.asarray(frames, jnp.float32), 5), path(frames))
+        assert ok.mean() > 0.9
+        errors.append(error[ok])
+        moves.append(np.diff(path(frames), prepend=path(0))[ok])
+    rms = np.sqrt(np.mean(np.concatenate(errors) ** 2))
+    assert rms < 0.6 * np.sqrt(np.mean(np.concatenate(moves) ** 2))
+    assert np.median(np.abs(np.concatenate(errors))) < 0.003
+
+
+def test_windows_are_causal():
+    rng = np.random.default_rng(0)
+    reads = phase_reads(simulate_reads(rng, smooth_path(rng, 1.0, 6), 6), "A", 0)
+    frames = jnp.arange(60, dtype=jnp.float32) / 15
+    model = radio_model(reads)
+    early = reads.time_s <= 2.0
+    cut = PhaseReads(
+        reads.time_s, reads.phase_rad, reads.carrier_hz, reads.sigma_rad, reads.channel, reads.valid & early
+    )
+    whole, part = (radio_windows(r, frames, 5, "robust", model) for r in (reads, cut))
+    # The reference carrier is a mean over the buffer: a constant of the recording that shifts by a hop at most.
+    np.testing.assert_allclose(whole.relative_m[:30], part.relative_m[:30], atol=2e-3)
+    assert bool(jnp.isinf(part.std_m[-5:]).all())
+
+
+def test_it_says_when_it_does_not_know():
+    frames = jnp.arange(30, dtype=jnp.float32) / 10
+    nothing = _buffer(np.zeros(4), np.zeros(4))
+    nothing = PhaseReads(
+        nothing.time_s, nothing.phase_rad, nothing.carrier_hz, nothing.sigma_rad, nothing.channel, jnp.zeros(4, bool)
+    )
+    one = PhaseReads(
+        nothing.time_s, nothing.phase_rad, nothing.carrier_hz, nothing.sigma_rad, nothing.channel, jnp.arange(4) == 0
+    )
+    for reads in (nothing, one):
+        for estimator in ("robust", "paper"):
+            window = radio_windows(reads, frames, 5, estimator, RadioModel() if estimator == "robust" else None)
+            assert bool(jnp.isinf(window.std_m[5:]).all())
+            assert bool(jnp.isfinite(window.relative_m).all())
+    time_s = np.concatenate([np.arange(0, 1, 0.02), np.arange(2.0, 3, 0.02)])
+    gap = _buffer(time_s, 4 * np.pi * 920e6 / C * 0.5 * time_s)
+    window = radio_windows(gap, frames, 3, "robust", RadioModel())
+    assert bool(jnp.isinf(window.std_m[17:20]).all())
+    assert bool((window.std_m[8:10] < 0.02).all())
+
+
+def test_window_reads_are_those_of_the_window():
+    reads = _buffer(np.arange(50) * 0.02, np.zeros(50))
+    frames = jnp.arange(10, dtype=jnp.float32) * 0.1
+    out = window_reads(reads, frames, 3, 16)
+    times = np.asarray(out.time_s[5])[np.asarray(out.valid[5])]
+    assert times.min() >= 0.3 - 1e-6
+    assert times.max() <= 0.5 + 1e-6
+    assert len(times) == 11
+    few = window_reads(reads, frames, 3, 4)
+    np.testing.assert_allclose(np.asarray(few.time_s[5]), [0.44, 0.46, 0.48, 0.5], atol=1e-6)
+
+
+def test_jit_and_vmap_change_nothing():
+    rng = np.random.default_rng(0)
+    pair = [phase_reads(simulate_reads(rng, smooth_path(rng, 1.0, 3), 3), "A", 0) for _ in range(2)]
+    frames = jnp.arange(20, dtype=jnp.float32) / 10
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pair)
+    together = jax.vmap(lambda r: paper_windows(r, frames, 5))(stacked)
+    for i, reads in enumerate(pair):
+        np.testing.assert_allclose(together.relative_m[i], paper_windows(reads, frames, 5).relative_m, atol=1e-6)
+
+
+def rail_reads(folder, epc):
+    """The antenna-rail table as a recording in time: 1.6 s a position, 8 channels of 0.2 s each."""
+    with open(folder / "rfid" / "antenna-rail" / "rail_50_positions.csv", encoding="utf-8-sig") as file:
+        rows = [row for row in csv.DictReader(file) if row["epc"] == epc]
+    carriers = np.random.default_rng(0).permutation(sorted({float(row["frequency"]) for row in rows}))
+    chosen, x_m = [], []
+    for position in range(50):
+        here = [row for row in rows if int(row["position"]) == position]
+        x_m.append(float(here[0]["x"]))
+        for carrier in carriers:
+            chosen += [row for row in here if float(row["frequency"]) == carrier][:10]
+    count = len(chosen)
+    time_s = (np.arange(count) + 0.5) * 0.02
+    reads = TagReads(
+        epc=np.full(count, epc),
+        time_ns=(time_s * 1e9).astype(np.int64),
+        antenna=np.ones(count, np.int16),
+        carrier_hz=np.array([float(row["frequency"]) for row in chosen]),
+        phase_rad=np.mod([float(row["phase"]) for row in chosen], 2 * np.pi),
+        rssi_dbm=np.array([float(row["RSSI"]) for row in chosen], np.float32),
+        doppler_hz=np.full(count, np.nan, np.float32),
+    )
+    return reads, time_s, np.array(x_m)
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("tag", range(5))
+def test_hopping_over_the_rail_costs_less_than_2_mm_against_unwrapping_each_channel(real_data, tag):
+    """The estimator against its own data at its best: every channel unwrapped alone, with all reads averaged."""
+    epc = f"10000000000000000000000{tag}"
+    reads, time_s, _ = rail_reads(real_data, epc)
+    buffer = phase_reads(reads, epc, 0)
+    distance = np.asarray(filter_reads(buffer, radio_model(buffer)).distance_m)[: len(time_s)]
+    position = (time_s // 1.6).astype(int)
+    estimated = np.array([distance[position == p].mean() for p in range(50)])
+    alone = []
+    for carrier in np.unique(reads.carrier_hz):
+        own = reads.carrier_hz == carrier
+        mean = [np.angle(np.mean(np.exp(1j * reads.phase_rad[own & (position == p)]))) for p in range(50)]
+        unwrapped = np.unwrap(mean) * C / (4 * np.pi * carrier)
+        alone.append(unwrapped - unwrapped.mean())
+    error = estimated - estimated.mean() - np.mean(alone, axis=0)
+    assert np.sqrt(np.mean(error**2)) < 0.002
