@@ -6,6 +6,7 @@ flow is zero and every distance is known exactly. A tag sits on each.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -75,6 +76,23 @@ def recording(num_frames: int = 40, *, seed: int = 0, rate_hz: float = 10.0, nam
         reads=reads,
         truth=truth,
         name=name,
+    )
+
+
+def enlarged(recording: Recording, scale: int) -> Recording:
+    """The same scene with each pixel repeated, for stages that need a picture of some size."""
+    truth = recording.truth
+    assert truth is not None
+    grow = lambda images: np.repeat(np.repeat(np.asarray(images), scale, axis=1), scale, axis=2)  # noqa: E731
+    lens = recording.intrinsics
+    return dataclasses.replace(
+        recording,
+        colour=grow(recording.colour[:]),
+        depth=grow(recording.depth[:]),
+        intrinsics=Intrinsics(
+            1e4, 1e4, lens.cx_px * scale, lens.cy_px * scale, lens.width * scale, lens.height * scale
+        ),
+        truth=dataclasses.replace(truth, labels=grow(truth.labels[:] if truth.labels is not None else 0)),
     )
 
 

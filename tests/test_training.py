@@ -169,6 +169,7 @@ def test_training_lowers_the_loss_and_finds_the_objects() -> None:
     held_out = synthetic.load(synthetic.recording(40, seed=5), 8, 28)
     before = clip_loss(state.tracer, held_out.camera, held_out.frames, KEY, SETTINGS)
     clips = synthetic.ClipCycle([synthetic.recording(40, seed=s) for s in range(2)])
+    numbers: dict[str, float] = {}
     for _ in range(40):
         state, numbers = train_step(state, [next(clips)], optimizer, SETTINGS)
     after = clip_loss(state.tracer, held_out.camera, held_out.frames, KEY, SETTINGS)
