@@ -71,9 +71,16 @@ def test_label_box_and_border() -> None:
     box = metrics.label_box(labels, 4)
     np.testing.assert_array_equal(box, [3, 2, 7, 4])
     assert np.isnan(metrics.label_box(labels, 1)).all()
-    assert not metrics.touches_border(box, 10, 12)
-    assert metrics.touches_border(np.array([3, 2, 11, 4.0]), 10, 12)
-    assert metrics.touches_border(np.array([3, 0, 7, 4.0]), 10, 12)
+    area = metrics.known_area(labels)
+    np.testing.assert_array_equal(area, [0, 0, 11, 9])
+    assert not metrics.touches_border(box, area, margin_px=1.0)
+    assert metrics.touches_border(box, area, margin_px=2.0)  # y0 = 2
+    assert metrics.touches_border(np.array([3, 2, 11, 4.0]), area)
+    assert metrics.touches_border(np.array([3, 0, 7, 4.0]), area)
+    # Where depth does not reach the edge of the picture, the labels' own edge counts.
+    labels[:, :3] = labels[:2] = Truth.IGNORE
+    np.testing.assert_array_equal(metrics.known_area(labels), [3, 2, 11, 9])
+    assert metrics.touches_border(box, metrics.known_area(labels))
 
 
 def test_time_to_lock_skips_invalid_frames() -> None:
@@ -94,6 +101,10 @@ def test_moved_for_adds_up_moving_time_only() -> None:
     np.testing.assert_array_equal(np.flatnonzero(metrics.moved_for(truth, "a", time_s, 1.0)), np.arange(7, 12))
     assert not metrics.moved_for(truth, "b", time_s, 1.0).any()
     assert metrics.moved_for(truth, "b", time_s, 0.0).all()
+    gone = Truth(tag_range_m={"a": np.where(np.arange(12) == 8, np.nan, range_m)})
+    np.testing.assert_array_equal(np.flatnonzero(metrics.moved_for(gone, "a", time_s, 0.5)), np.arange(5, 12))
+    restarted = metrics.moved_for(gone, "a", time_s, 0.5, restarts=True)
+    np.testing.assert_array_equal(np.flatnonzero(restarted), [5, 6, 7, 11])
     # A tag that circles the antenna moves although its range does not change.
     circle = np.stack([np.cos(time_s), 0 * time_s, np.sin(time_s)], axis=-1)
     round_trip = Truth(tag_range_m={"a": np.ones(12)}, tag_position_m={"a": circle})

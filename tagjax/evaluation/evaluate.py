@@ -25,6 +25,8 @@ class ScoreSettings:
 
     moved_for_s: float = 1.5  # score a tag once it has moved for this long
     min_speed_m_s: float = 0.1  # slower than this is no motion
+    moved_restarts: bool = False  # whether a tag that was out of sight has to move that long again
+    border_px: float = 2.0  # an object this near to the edge of the labelled area may be cut off: not scored
     threshold: float = 0.5  # IoU of a lock and of a success
     lock_frames: int = 5
     min_pixels: int = 100  # an object that shows less is not scored
@@ -220,13 +222,14 @@ def evaluate_recording(
 def _score_frame(
     mask: np.ndarray, box_px: np.ndarray, labels: np.ndarray, label: int, settings: ScoreSettings
 ) -> tuple[float, float, float, int, bool]:
-    height, width = labels.shape
     true_box = metrics.label_box(labels, label)
     shows = int(np.sum(labels == label)) >= settings.min_pixels
-    whole = shows and not bool(metrics.touches_border(true_box, height, width))
+    whole = shows and not bool(
+        metrics.touches_border(true_box, metrics.known_area(labels), margin_px=settings.border_px)
+    )
     return (
         float(metrics.box_iou(box_px, true_box)),
-        float(metrics.centre_error(box_px, true_box, width)),
+        float(metrics.centre_error(box_px, true_box, labels.shape[1])),
         metrics.mask_iou(mask, labels, label),
         metrics.most_covered(mask, labels, min_pixels=settings.min_pixels),
         whole,
@@ -249,7 +252,14 @@ def _tag_frames(
     iou, cle_px, mask_j, identified, shown, confidence, found = (np.array(column) for column in zip(*rows, strict=True))
     if label in truth.visible:
         shown = shown & np.asarray(truth.visible[label], bool)[part]
-    moved = metrics.moved_for(truth, epc, time_s, settings.moved_for_s, min_speed_m_s=settings.min_speed_m_s)
+    moved = metrics.moved_for(
+        truth,
+        epc,
+        time_s,
+        settings.moved_for_s,
+        min_speed_m_s=settings.min_speed_m_s,
+        restarts=settings.moved_restarts,
+    )
     return FrameScores(
         time_s=time_s[part],
         iou=iou.astype(np.float64),

@@ -81,10 +81,22 @@ def label_box(labels: Integer[np.ndarray, "height width"], label: int) -> Float[
     return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.float64)
 
 
-def touches_border(box_px: Shaped[np.ndarray, "*batch 4"], height: int, width: int) -> Bool[np.ndarray, "*batch"]:
-    """Whether a box reaches the outermost pixels of the picture, where the object may be cut off."""
-    x0, y0, x1, y1 = np.moveaxis(np.asarray(box_px), -1, 0)
-    return np.asarray((x0 <= 0) | (y0 <= 0) | (x1 >= width - 1) | (y1 >= height - 1))
+def known_area(labels: Integer[np.ndarray, "height width"]) -> Float[np.ndarray, " 4"]:
+    """Box x0 y0 x1 y1 (inclusive) of what is labelled: rows and columns at the edges that are all ignored are cut."""
+    known = labels != Truth.IGNORE
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    if not len(rows):
+        return np.full(4, np.nan)
+    return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.float64)
+
+
+def touches_border(
+    box_px: Shaped[np.ndarray, "*batch 4"], area_px: Float[np.ndarray, " 4"], *, margin_px: float = 0.0
+) -> Bool[np.ndarray, "*batch"]:
+    """Whether a box comes within `margin_px` of the edge of the known area, where the object may be cut off."""
+    x0, y0, x1, y1 = np.moveaxis(np.asarray(box_px, np.float64), -1, 0)
+    left, top, right, bottom = np.asarray(area_px) + margin_px * np.array([1.0, 1.0, -1.0, -1.0])
+    return np.asarray((x0 <= left) | (y0 <= top) | (x1 >= right) | (y1 >= bottom))
 
 
 def time_to_lock(
@@ -113,12 +125,19 @@ def time_to_lock(
 
 
 def moved_for(
-    truth: Truth, epc: str, time_s: Float[np.ndarray, " time"], seconds: float, *, min_speed_m_s: float = 0.1
+    truth: Truth,
+    epc: str,
+    time_s: Float[np.ndarray, " time"],
+    seconds: float,
+    *,
+    min_speed_m_s: float = 0.1,
+    restarts: bool = False,
 ) -> Bool[np.ndarray, " time"]:
     """Frames by which the tag has moved for `seconds` in total since the recording's start.
 
     Speed is that of the true position, or of the true range where no position is known; frames where neither is known
-    add nothing. Without any such truth every frame counts, if `seconds` is 0; else none does.
+    add nothing, or with `restarts` set the clock back: an object that comes back has to be found anew. Without any such
+    truth every frame counts, if `seconds` is 0; else none does.
     """
     if seconds <= 0:
         return np.ones(len(time_s), dtype=bool)
@@ -132,7 +151,11 @@ def moved_for(
     step_m = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         moving = np.nan_to_num(step_m / step_s) > min_speed_m_s
-    return np.cumsum(np.where(moving, step_s, 0.0)) >= seconds - 1e-9
+    total = np.cumsum(np.where(moving, step_s, 0.0))
+    if restarts:
+        unknown = ~np.all(np.isfinite(place), axis=-1)
+        total = total - np.maximum.accumulate(np.where(unknown, total, 0.0))
+    return total >= seconds - 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
