@@ -51,8 +51,13 @@ def att_corr(
     rho = weight * (rho_m - jnp.sum(weight * rho_m, axis=-1, keepdims=True) / count)
     rd = weight * (rd_m - jnp.sum(weight * rd_m, axis=-1, keepdims=True) / count)
     covariance = jnp.sum(rho * rd, axis=-1)
-    scale = safe_sqrt(jnp.sum(rho * rho, axis=-1)) * safe_sqrt(jnp.sum(rd * rd, axis=-1))
+    scale = safe_sqrt(_varying(jnp.sum(rho * rho, axis=-1))) * safe_sqrt(_varying(jnp.sum(rd * rd, axis=-1)))
     return jnp.clip(jax.nn.relu(safe_divide(covariance, scale)), 0.0, 1.0)
+
+
+def _varying(squares_m2: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Sums of squares below (0.1 um)^2 taken for none: rounding, whose quotients have no finite gradient."""
+    return jnp.where(squares_m2 > 1e-14, squares_m2, 0.0)
 
 
 def attention(
