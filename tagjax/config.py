@@ -37,6 +37,7 @@ class ClipSettings:
     window: int = 5  # frames in a motion vector (k)
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
+    estimator: Literal["robust", "paper"] = "robust"  # of the tags' distances
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
 
@@ -80,6 +81,7 @@ class TrainConfig:
     tracer: Mapping[str, Any]
     optimizer: Mapping[str, Any]
     baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside it
+    baseline_estimators: Mapping[str, str] = dataclasses.field(default_factory=dict)  # where not the clips' own
     seed: int = 0
     clip_norm: float = 1.0
     resume: bool = True  # go on from the run folder's newest checkpoint, if it holds one
@@ -103,6 +105,7 @@ class EvaluateConfig:
     frames: tuple[int, int] | None = None
     clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
     baselines: Mapping[str, Mapping[str, Any]] | None = None
+    baseline_estimators: Mapping[str, str] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
     progress: bool = True

@@ -12,7 +12,7 @@ from ..data.store import open_recording
 from ..tracer import AbstractTracer
 from ..training.checkpoint import Checkpoints
 from ..training.run import evaluate_tracers, make_tracer
-from ..training.sources import clip_loader, training_recordings, with_virtual_tags
+from ..training.sources import training_recordings, with_virtual_tags
 from ..training.state import TrainState
 from ..training.step import make_optimizer
 
@@ -35,6 +35,7 @@ def run_evaluation(
     recordings the run's own held-out ones are used.
     """
     clips, baselines, recordings = config.clips, dict(config.baselines or {}), []
+    estimators = dict(config.baseline_estimators or {})
     if config.run is not None:
         if run_values is None:
             raise ConfigError(f"run={config.run}: its configuration was not given.")
@@ -42,6 +43,7 @@ def run_evaluation(
         tracers = {"learned": restore_tracer(Path(config.run), trained, step=config.checkpoint)}
         clips = trained.data.clips
         baselines = dict(trained.baselines) if config.baselines is None else baselines
+        estimators = dict(trained.baseline_estimators) | estimators
         if not config.recordings:
             recordings = training_recordings(trained.data)[1]
     elif config.tracer is not None:
@@ -58,8 +60,8 @@ def run_evaluation(
         tracers,
         recordings,
         folder,
-        load=clip_loader(clips),
-        stride=clips.stride,
+        clips=clips,
+        estimators=estimators,
         settings=config.scores,
         epcs=config.epcs,
         frames=config.frames,

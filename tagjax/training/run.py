@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,8 +100,8 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
         tracers,
         validation,
         folder / "report",
-        load=clip_loader(clips),
-        stride=clips.stride,
+        clips=clips,
+        estimators=config.baseline_estimators,
         settings=config.scores,
         epcs=clips.epcs,
         progress=config.loop.progress,
@@ -140,20 +140,33 @@ def evaluate_tracers(
     recordings: Sequence[Recording],
     folder: Path,
     *,
-    load: Callable[..., Clip],
-    stride: int,
+    clips: ClipSettings,
+    estimators: Mapping[str, str] | None = None,
     settings: ScoreSettings,
     epcs: Sequence[str] | None = None,
     frames: tuple[int, int] | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run each tracer over each recording, write the report into `folder` and return its summary."""
+    """Run each tracer over each recording, write the report into `folder` and return its summary.
+
+    `estimators` names the radio estimator of tracers that do not take the clips' own.
+    """
+    loaders = {
+        name: clip_loader(dataclasses.replace(clips, estimator=(estimators or {}).get(name, clips.estimator)))
+        for name in tracers
+    }
     work = [(name, number) for name in tracers for number in range(len(recordings))]
     results: dict[str, list[RecordingResult]] = {name: [] for name in tracers}
     for name, number in track(work, description="evaluate", disable=not progress):
         results[name].append(
             evaluate_recording(
-                tracers[name], recordings[number], load, stride=stride, epcs=epcs, settings=settings, frames=frames
+                tracers[name],
+                recordings[number],
+                loaders[name],
+                stride=clips.stride,
+                epcs=epcs,
+                settings=settings,
+                frames=frames,
             )
         )
     return write_report(folder, results)

@@ -29,6 +29,7 @@ def clip_loader(settings: ClipSettings) -> Callable[..., Clip]:
             flow=settings.flow,
             window=settings.window,
             max_reads=settings.max_reads,
+            estimator=settings.estimator,
         )
 
     return load

@@ -1,0 +1,138 @@
+"""The main job through its own command lines: train on stored recordings, resume, evaluate the run, refuse bad ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import pytest
+import synthetic_clips as synthetic
+
+from tagjax.config import EvaluateConfig, TrainConfig, from_mapping
+from tagjax.data.store import save_recording
+from tagjax.evaluation.run import run_evaluation
+from tagjax.recording import RecordingError, TagReads
+from tagjax.training.run import run_training
+from tagjax.training.sources import join_reads
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def _defaults_of_jax() -> Iterator[None]:
+    """The main job runs under JAX's own promotion rules, as it does for users."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Two stored recordings of the synthetic scene."""
+    folder = tmp_path_factory.mktemp("recordings")
+    paths = []
+    for seed in range(2):
+        path = folder / f"scene{seed}.zarr"
+        save_recording(synthetic.enlarged(synthetic.recording(26, seed=seed, name=f"scene{seed}"), 4), path)
+        paths.append(str(path))
+    return paths
+
+
+def _values(recordings: list[str]) -> dict:
+    return {
+        "tracer": {"_target_": "tagjax.tagattention.TagAttention", "cell": 4},
+        "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},
+        "baselines": {"paper": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4}},
+        "data": {
+            "recordings": recordings[:1],
+            "validation": recordings[1:],
+            "clips": {"stride": 4, "length": 10},
+        },
+        "objective": {"span_frames": 5, "skip_frames": 3, "max_reads": 64, "num_channels": 4, "future_stride": 1},
+        "loop": {"num_steps": 2, "batch_size": 1, "checkpoint_every": 1, "validate_every": 2, "progress": False},
+        "logger": {"mode": "disabled"},
+        "scores": {"num_pictures": 2, "moved_for_s": 0.5},
+    }
+
+
+def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> None:
+    values = _values(recordings)
+    score = run_training(from_mapping(TrainConfig, values), tmp_path)
+    assert 0.0 <= score <= 1.0
+    summary = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(summary) == {"learned", "untrained", "paper"}
+    assert summary["learned"]["all"]["iou"] == pytest.approx(score)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 2]
+    assert "validation/own_coherence" in rows[-1]
+    assert (tmp_path / "report" / "frames.csv").is_file()
+    changed = json.loads((tmp_path / "parameters.json").read_text())
+    assert changed["learned"] != changed["untrained"]
+
+    config = from_mapping(EvaluateConfig, {"run": str(tmp_path), "recordings": recordings[1:], "progress": False})
+    again = run_evaluation(config, tmp_path / "again", run_values={**values, "scores": {}})
+    assert set(again) == {"learned", "paper"}
+    part = from_mapping(
+        EvaluateConfig, {"run": str(tmp_path), "frames": [0, 9], "baselines": {}, "stride": 8, "progress": False}
+    )
+    held_out = run_evaluation(part, tmp_path / "part", run_values=values)
+    assert set(held_out) == {"learned"}
+    with (tmp_path / "part" / "frames.csv").open() as file:
+        assert len(file.readlines()) == 1 + 2 * 9
+
+
+def test_the_same_recording_cannot_be_held_out(recordings: list[str], tmp_path: Path) -> None:
+    values = _values(recordings)
+    values["data"]["validation"] = values["data"]["recordings"]
+    with pytest.raises(RecordingError, match="hold it out"):
+        run_training(from_mapping(TrainConfig, values), tmp_path)
+
+
+@pytest.mark.slow
+def test_command_lines(recordings: list[str], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    common = [sys.executable, "-m"]
+    subprocess.run(
+        [
+            *common,
+            "experiments.train",
+            "debug=default",
+            f"data.recordings=[{recordings[0]}]",
+            f"data.validation=[{recordings[1]}]",
+            "data.clips.stride=4",
+            "tracer.cell=4",
+            f"hydra.run.dir={run}",
+        ],
+        cwd=ROOT,
+        check=True,
+    )
+    for name in ("config.yaml", "metrics.jsonl", "metrics.json", "checkpoints", "report"):
+        assert (run / name).exists()
+    done = subprocess.run(
+        [
+            *common,
+            "experiments.evaluate",
+            f"run={run}",
+            f"recordings=[{recordings[1]}]",
+            f"hydra.run.dir={tmp_path / 'evaluation'}",
+        ],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    last = json.loads(done.stdout.strip().splitlines()[-1])
+    assert last == json.loads((tmp_path / "evaluation" / "metrics.json").read_text())
+
+
+def test_reads_of_unlike_conventions_are_not_joined() -> None:
+    one = synthetic.recording(6).reads
+    both = join_reads([one, one[:3]])
+    assert both.num_reads == one.num_reads + 3
+    assert (both.time_ns[1:] >= both.time_ns[:-1]).all()
+    with pytest.raises(RecordingError, match="convert first"):
+        join_reads([one, dataclasses.replace(TagReads.empty(), phase_sign=-1)])
