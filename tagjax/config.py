@@ -48,6 +48,10 @@ class SimulateSettings:
 
     num_recordings: int = 3
     num_frames: int = 90
+    width: int = 320
+    height: int = 240
+    frame_rate_hz: float = 10.0
+    num_people: int = 3
     seed: int = 0
     validation_seed: int = 1000
     folder: str = "recordings"

@@ -32,7 +32,7 @@ from tagjax.training.loss import (
 from tagjax.training.state import TrainState
 from tagjax.training.step import clip_gradient, clip_loss, make_optimizer, train_step
 
-SETTINGS = ObjectiveSettings(span_frames=8, skip_frames=4, max_reads=128, num_channels=4, future_stride=1)
+SETTINGS = ObjectiveSettings(memory=1.0, span_frames=8, skip_frames=4, max_reads=128, num_channels=4, future_stride=1)
 KEY = jax.random.PRNGKey(0)
 
 

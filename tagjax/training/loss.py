@@ -39,6 +39,7 @@ class ObjectiveSettings:
     future_alpha_m2: float = 1e-3  # a pixel agrees with the future if it is within about the root of this
     future_stride: int = 2  # every n-th working pixel is asked
     rematerialise: bool = True  # keep only the tracer's states for the backward pass
+    memory: float = 0.5  # share of the gradient that a frame hands on to the frame before
 
     def weights(self) -> dict[str, float]:
         """The weight of each term that takes part, by name."""
@@ -58,16 +59,30 @@ class Seen(eqx.Module):
     reads: PhaseReads  # (tag, reads): each read of the clip once
 
 
-class _Rematerialised(AbstractTracer):
-    """A tracer whose step is computed again in the backward pass instead of being kept."""
+class _Trained(AbstractTracer):
+    """A tracer as the backward pass sees it: steps computed again rather than kept, gradients fading into the past.
+
+    A recurrent tracer multiplies gradients from frame to frame; without fading, those of the first frames drown all
+    others. Values are unchanged.
+    """
 
     tracer: AbstractTracer
+    memory: float = eqx.field(static=True)
+    rematerialise: bool = eqx.field(static=True)
 
     def init(self, camera: Camera, frame: Frame) -> Any:
         return self.tracer.init(camera, frame)
 
     def step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
+        state = jax.tree.map(self._fade, state)
+        if not self.rematerialise:
+            return self.tracer.step(camera, state, frame)
         return eqx.filter_checkpoint(lambda t, c, s, f: t.step(c, s, f))(self.tracer, camera, state, frame)
+
+    def _fade(self, leaf: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            return leaf
+        return self.memory * leaf + jax.lax.stop_gradient((1.0 - self.memory) * leaf)
 
     def finish(self, state: Any) -> Any:
         return self.tracer.finish(state)
@@ -75,7 +90,7 @@ class _Rematerialised(AbstractTracer):
 
 def see(tracer: AbstractTracer, camera: Camera, frames: Frame, settings: ObjectiveSettings) -> Seen:
     """Run the tracer over a clip (leading time axis)."""
-    wrapped = _Rematerialised(tracer) if settings.rematerialise else tracer
+    wrapped = _Trained(tracer, settings.memory, settings.rematerialise)
     return Seen(camera, frames, trace(wrapped, camera, frames), clip_reads(frames, settings))
 
 

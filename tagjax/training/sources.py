@@ -46,9 +46,10 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
     if not data.recordings:
         return simulated_recordings(data.simulate)
     tag = data.virtual_tag
-    return tuple(
+    training, validation = (
         [with_virtual_tags(open_recording(path), tag) for path in paths] for paths in (data.recordings, data.validation)
-    )  # type: ignore[return-value]
+    )
+    return training, validation
 
 
 def simulated_recordings(settings: SimulateSettings) -> tuple[list[Recording], list[Recording]]:
@@ -58,12 +59,17 @@ def simulated_recordings(settings: SimulateSettings) -> tuple[list[Recording], l
 
 
 def _simulated(settings: SimulateSettings, seed: int) -> Recording:
-    path = Path(settings.folder) / f"simulated-{settings.num_frames}frames-seed{seed}.zarr"
+    scene = dataclasses.asdict(settings)
+    for name in ("num_recordings", "seed", "validation_seed", "folder"):
+        del scene[name]
+    size = (
+        f"{settings.width}x{settings.height}-{settings.num_frames}f-{settings.frame_rate_hz:g}hz-{settings.num_people}p"
+    )
+    path = Path(settings.folder) / f"simulated-{size}-seed{seed}.zarr"
     if not path.exists():
-        from ..sim.session import simulate_recording
+        from ..sim.session import SceneSettings, simulate_recording
 
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_recording(simulate_recording(num_frames=settings.num_frames, seed=seed), path)
+        save_recording(simulate_recording(SceneSettings(**scene), seed=seed, progress=True), path)
     return open_recording(path)
 
 
