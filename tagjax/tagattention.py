@@ -236,7 +236,9 @@ class TagAttention(AbstractTracer):
         log_odds, mask, centre, velocity, confidence = jax.vmap(one_tag)(
             carried, frame.radio, frame.reads, state.centre_m, state.velocity_m_s, state.confidence
         )
-        new_state = TagAttentionState(motion, time_s, log_odds, centre, velocity, confidence)
+        # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
+        place = jax.lax.stop_gradient((centre, velocity, confidence))
+        new_state = TagAttentionState(motion, time_s, log_odds, *place)
         return new_state, describe(mask, centre, step_m, recent, confidence, self.box_tail)
 
     def finish(self, state: TagAttentionState) -> TagAttentionState:
