@@ -1,1 +1,1 @@
-"""."""
+"""Recordings on disk, clips, and importers."""

@@ -1,1 +1,1 @@
-"""."""
+"""Optical flow: named baselines. `tagjax.flow.opencv` imports cv2."""

@@ -1,1 +1,1 @@
-"""."""
+"""Image operations: warps."""

@@ -1,1 +1,1 @@
-"""."""
+"""Learning without labels: objective, step, loop, checkpoints, logging."""

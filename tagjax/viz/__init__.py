@@ -1,1 +1,1 @@
-"""."""
+"""Pictures: overlays and curves."""

@@ -1,1 +1,1 @@
-"""."""
+"""Importers: foreign formats to recordings."""
