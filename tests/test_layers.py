@@ -49,7 +49,7 @@ def _part(path: Path) -> str:
 def _imported_parts(path: Path) -> set[str]:
     here = path.relative_to(ROOT).with_suffix("").parts
     if here[-1] == "__init__":
-        here = here[:-1] + ("",)
+        here = (*here[:-1], "")
     parts = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):

@@ -127,7 +127,7 @@ def open_recording(path: str | Path, *, check: bool = True) -> Recording:
 
 
 def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: bool) -> Recording:
-    def array(name: str) -> zarr.Array:
+    def array(name: str) -> Any:
         found = root.get(name)
         if not isinstance(found, zarr.Array):
             raise RecordingError(f"{path}: array {name!r} is missing. Was the copy cut short? Copy it again.")

@@ -24,7 +24,7 @@ class DISFlow:
     def __init__(self, preset: str = "medium"):
         if preset not in DIS_PRESETS:
             raise ValueError(f"Unknown DIS preset {preset!r}; expected one of {', '.join(DIS_PRESETS)}.")
-        self._dis = cv2.DISOpticalFlow_create(DIS_PRESETS[preset])
+        self._dis = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
 
     def __call__(self, gray_from: np.ndarray, gray_to: np.ndarray) -> np.ndarray:
         return self._dis.calc(gray_from, gray_to, None)  # type: ignore[call-overload]

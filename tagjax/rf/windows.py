@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def radio_model(reads: PhaseReads, **settings: float) -> RadioModel:
     host = {name: np.asarray(getattr(reads, name))[valid] for name in ("phase_rad", "time_s", "channel", "carrier_hz")}
     share = pi_flip_share(host["phase_rad"], host["time_s"], host["channel"])
     slope = estimate_slope(host["phase_rad"], host["time_s"], host["channel"], host["carrier_hz"])
-    chosen = {
+    chosen: dict[str, Any] = {
         "flip_share": float(np.clip(share, 0.01, 0.45)) if np.isfinite(share) else DEFAULT_FLIP_SHARE,
         "slope_rad_hz": slope.slope_rad_hz,
         "hop_rad": slope.residual_rad,

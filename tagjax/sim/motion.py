@@ -95,9 +95,7 @@ def limb_shapes(height_m: float) -> list[tuple[str, float, float]]:
     ]
 
 
-def limb_poses(
-    walk: Walk, step: int, height_m: float
-) -> tuple[np.ndarray, np.ndarray]:
+def limb_poses(walk: Walk, step: int, height_m: float) -> tuple[np.ndarray, np.ndarray]:
     """World centre (limbs, 3) and axis direction (limbs, 3, unit) of every limb at a step of the walk."""
     scale = height_m / 1.75
     pace = min(1.0, float(np.linalg.norm(walk.velocity_m_s[step])) / 1.0)

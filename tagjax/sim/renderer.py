@@ -1,5 +1,8 @@
 """RGB-D pictures of a scene by ray casting (no OpenGL), with depth noise, labels and exact flow."""
 
+# MuJoCo's names come from a compiled module that the type checker cannot read.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import dataclasses
@@ -133,9 +136,7 @@ def sense_depth(hits: Hits, view: Viewpoint, rng: np.random.Generator) -> np.nda
     return np.where(missing, 0, np.rint(quantised * 1000)).astype(np.uint16)
 
 
-def exact_flow(
-    before: Hits, after: Hits, scene_after: Scene, view: Viewpoint
-) -> tuple[np.ndarray, np.ndarray]:
+def exact_flow(before: Hits, after: Hits, scene_after: Scene, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
     """Flow of `before`'s pixels into the next picture, float32 (height, width, 2), and where its target is hidden.
 
     The scene must be posed for `after`: each hit point is carried along by its geom.

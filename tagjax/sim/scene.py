@@ -1,5 +1,8 @@
 """A furnished room with walking people, as a MuJoCo model. Needs the `sim` extra."""
 
+# MuJoCo's names come from a compiled module that the type checker cannot read.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import dataclasses

@@ -45,9 +45,7 @@ def simulate_recording(settings: SceneSettings | None = None, *, seed: int, prog
     scene = build_scene(settings.num_people, duration_s, _SUBSTEPS_S, rng)
     focal = 534.0 * settings.width / 640
     view = corner_camera(
-        Intrinsics(
-            focal, focal, (settings.width - 1) / 2, (settings.height - 1) / 2, settings.width, settings.height
-        ),
+        Intrinsics(focal, focal, (settings.width - 1) / 2, (settings.height - 1) / 2, settings.width, settings.height),
         rng,
     )
     stamps = np.arange(settings.num_frames) / settings.frame_rate_hz

@@ -67,6 +67,14 @@ def read_colour(path: Path) -> np.ndarray:
     return picture[..., ::-1]
 
 
+def read_labels(path: Path) -> np.ndarray:
+    """A label picture, uint8 (height, width)."""
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise RecordingError(f"{path}: no readable picture (cut short?). Copy it again.")
+    return picture
+
+
 def read_mat_depth(path: Path) -> np.ndarray:
     """`depth_array` of a MATLAB file, uint16 millimetres."""
     try:
@@ -134,8 +142,7 @@ def import_jpg_mat(
         labels = sorted(Path(masks).glob("*.png"))
         if len(labels) != len(pictures):
             raise RecordingError(f"{masks}: {len(labels)} masks for {len(pictures)} pictures; expected one a picture.")
-        decode = lambda path: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)  # noqa: E731
-        truth = Truth(labels=FrameFiles(labels, decode, first.shape[:2], np.uint8))
+        truth = Truth(labels=FrameFiles(labels, read_labels, first.shape[:2], np.uint8))
     return Recording(
         colour=FrameFiles(pictures, read_colour, first.shape, np.uint8),
         depth=FrameFiles(depths, registered, first.shape[:2], np.uint16),
