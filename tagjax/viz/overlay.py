@@ -60,6 +60,6 @@ def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[i
         cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
 
 
-def short_name(epc: str, length: int = 10) -> str:
+def short_name(epc: str, length: int = 12) -> str:
     """An EPC short enough for a picture: its end, which is where EPCs of one batch differ."""
     return epc if len(epc) <= length else f"..{epc[-length:]}"
