@@ -65,7 +65,9 @@ def push_gather(
     num_past = past.shape[-1]
     taps, weight = gather_taps(jnp.concatenate([past, valid.astype(past.dtype)], axis=-1), backward_px)
     values, known = taps[..., :num_past], taps[..., num_past:]
-    same_surface = (jnp.abs(values[..., -1] - distance_m[None]) <= max_step_m) & (known[..., -1] > 0) & (distance_m > 0)[None]
+    same_surface = (
+        (jnp.abs(values[..., -1] - distance_m[None]) <= max_step_m) & (known[..., -1] > 0) & (distance_m > 0)[None]
+    )
     weight = jnp.where(same_surface, weight, 0.0)[..., None] * known
     total = jnp.sum(weight, axis=0)
     carried = total > 1e-3
