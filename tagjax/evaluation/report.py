@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from rich.box import SIMPLE
 from rich.table import Table
 
 from ..viz.overlay import draw_overlay, short_name
@@ -156,7 +157,7 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
         "time_to_lock_s": "lock s",
         "num_frames": "frames",
     }
-    table = Table(title=title)
+    table = Table(title=title, box=SIMPLE, pad_edge=False)
     table.add_column("tracer", no_wrap=True)
     for heading in columns.values():
         table.add_column(heading, justify="right", no_wrap=True, min_width=len(heading))
