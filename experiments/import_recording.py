@@ -1,0 +1,34 @@
+"""Import an RGB-D video, a table of tag reads, or both, as one recording.
+
+python -m experiments.import_recording reads=table.csv                          # say what a table holds
+python -m experiments.import_recording video=<TUM folder> reads=table.csv out=recordings/a.zarr
+python -m experiments.import_recording video=<jpg+mat folder> calibration=cam.mat fps=7 tracks=tracks.csv out=b.zarr
+"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="import_recording")
+def main(config: DictConfig) -> None:
+    from rich.console import Console
+
+    from tagjax.config import from_mapping
+    from tagjax.data.importers.settings import ImportSettings, import_recording
+    from tagjax.recording import RecordingError
+
+    console = Console(soft_wrap=True, highlight=False)
+    try:
+        _, said = import_recording(from_mapping(ImportSettings, resolved(config)))
+    except RecordingError as error:
+        raise SystemExit(f"import_recording: {error}") from error
+    for line in said:
+        console.print(line, markup=False)
+
+
+if __name__ == "__main__":
+    main()

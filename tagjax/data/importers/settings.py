@@ -1,0 +1,108 @@
+"""What `experiments.import_recording` can be told, and the import itself."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...recording import Recording, RecordingError
+from ...sim.reader import ReaderSettings
+from ...sim.virtual_tag import attach_virtual_tags, load_tracks_csv
+from ..store import save_recording
+from .rgbd_folder import import_jpg_mat, import_tum
+from .tables import ImportReport, import_table
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportSettings:
+    """A video, a table of reads, or both; and where the recording goes."""
+
+    video: str | None = None
+    video_format: str = "auto"  # tum | jpg_mat | auto
+    calibration: str | None = None  # jpg_mat: .mat with cam_params
+    correction: tuple[float, ...] | None = None  # residual correction of the calibration, 7 numbers
+    masks: str | None = None  # jpg_mat: folder of label pictures
+    fps: float = 30.0  # jpg_mat: its folder holds no times
+    reads: str | None = None
+    format: str = "auto"
+    hop_table_hz: tuple[float, ...] | None = None
+    carrier_hz: float | None = None
+    clock: Any = "auto"  # auto | reader | arrival | seconds to add to the reader's clock
+    antennas_m: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0),)
+    tracks: str | None = None  # a virtual tag on each of these tracks
+    seed: int = 0
+    reader: dict[str, Any] = dataclasses.field(default_factory=dict)  # virtual reader
+    out: str | None = None
+
+
+def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[str]]:
+    """Import what `settings` name; the recording (None for a table alone) and what is to be said of it.
+
+    The recording is checked and, if `out` is given, saved. Raises `RecordingError`.
+    """
+    if settings.video is None and settings.reads is None:
+        raise RecordingError("Nothing to import: give video=<folder>, reads=<table>, or both.")
+    said: list[str] = []
+    table = None
+    if settings.reads is not None:
+        reads, audit, report = import_table(
+            settings.reads,
+            format=settings.format,
+            hop_table_hz=settings.hop_table_hz,
+            carrier_hz=settings.carrier_hz,
+            clock=settings.clock,
+        )
+        table = (reads, audit)
+        said += _table_lines(report, reads)
+    if settings.video is None:
+        return None, said
+    recording = _video(settings)
+    recording = dataclasses.replace(recording, antennas_m=np.asarray(settings.antennas_m, float))
+    if table is not None:
+        recording = dataclasses.replace(recording, reads=table[0], clock=table[1])
+    if settings.tracks is not None:
+        tracks = load_tracks_csv(settings.tracks, recording.frame_time_s())
+        recording = attach_virtual_tags(recording, tracks, ReaderSettings(**settings.reader), seed=settings.seed)
+        said.append(f"virtual tags on {len(tracks)} tracks, {recording.reads.num_reads} reads")
+    recording.check()
+    said.append(
+        f"{recording.num_frames} frames of {recording.intrinsics.width} x {recording.intrinsics.height}, "
+        f"{recording.frame_rate_hz:.1f} frames/s; {recording.source}"
+    )
+    if settings.out is not None:
+        save_recording(recording, settings.out, progress=True)
+        said.append(f"saved as {settings.out}")
+    return recording, said
+
+
+def _video(settings: ImportSettings) -> Recording:
+    assert settings.video is not None
+    folder = Path(settings.video)
+    if not folder.is_dir():
+        raise RecordingError(f"video={folder}: no such folder.")
+    chosen = settings.video_format
+    if chosen == "auto":
+        chosen = "tum" if (folder / "rgb.txt").is_file() else "jpg_mat"
+    if chosen == "tum":
+        return import_tum(folder)
+    if chosen != "jpg_mat":
+        raise RecordingError(f"video_format={chosen}: expected auto, tum or jpg_mat.")
+    if settings.calibration is None:
+        raise RecordingError("A folder of .jpg and .mat needs its calibration: give calibration=<file.mat>.")
+    correction: Sequence[float] | None = settings.correction
+    if correction is not None and len(correction) != 7:
+        raise RecordingError(f"correction has {len(correction)} numbers; expected 7 (dTx dTy dTz fx* fy* cx+ cy+).")
+    return import_jpg_mat(folder, settings.calibration, fps=settings.fps, correction=correction, masks=settings.masks)
+
+
+def _table_lines(report: ImportReport, reads) -> list[str]:
+    lines = report.lines()
+    for epc in reads.epcs:
+        own = reads.select(epc)
+        span_s = max(1e-9, (own.time_ns[-1] - own.time_ns[0]) * 1e-9)
+        lines.append(f"{epc}: {own.num_reads} reads in {span_s:.1f} s ({own.num_reads / span_s:.1f}/s)")
+    return lines
