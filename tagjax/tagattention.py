@@ -206,7 +206,7 @@ class TagAttention(AbstractTracer):
         )
         carried = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), frame.backward_px, jnp.zeros(())), -1, 0)
         # A surface that was hidden a frame ago brings no history of its own.
-        carried = jnp.where(motion.valid[..., -2] | ~valid, carried, 0.0)
+        carried = jnp.where((motion.valid[..., -2] | ~valid)[None], carried, 0.0)
 
         def one_tag(carried, radio, reads, centre, velocity, confidence):
             evidence = self._evidence(segments, rho, known, rho_segment, radio, reads, time_s)
@@ -301,13 +301,14 @@ class TagAttention(AbstractTracer):
         best = jnp.max(jnp.where(valid, total, -1e3))
         threshold = jnp.minimum(self.cut, best - jnp.exp(self.log_cut_margin))
         width = jnp.exp(self.log_cut_width)
-        weight = jax.nn.sigmoid((total - threshold) / width) * valid
-        peak = jnp.where(valid, jnp.exp((total - best) / width), 0.0)
+        known = valid.astype(total.dtype)
+        weight = jax.nn.sigmoid((total - threshold) / width) * known
+        peak = jnp.where(valid, jnp.exp(jnp.minimum(total - best, 0.0) / width), 0.0)
         start = jnp.sum(points * peak[..., None], axis=(0, 1)) / jnp.maximum(jnp.sum(peak), 1e-6)
         extent = jnp.exp(self.log_extent)
         centre = mean_shift(points, weight, start, extent)
         spread = jnp.sum(jnp.square(points - centre[None, None]), axis=-1) / (2.0 * extent**2)
-        return jax.nn.sigmoid((total - threshold - spread) / width) * valid, centre
+        return jax.nn.sigmoid((total - threshold - spread) / width) * known, centre
 
 
 def _first_of_channel(reads: PhaseReads) -> Array:
@@ -318,9 +319,9 @@ def _first_of_channel(reads: PhaseReads) -> Array:
 
 def _read_support(reads: PhaseReads) -> Float[Array, ""]:
     """Share of the reads left once every channel has spent one on its unknown offset; 0 without reads."""
-    count = jnp.sum(reads.valid)
-    groups = jnp.sum(reads.valid & (_first_of_channel(reads) == jnp.arange(reads.channel.shape[0])))
-    return jnp.where(count > 0, (count - groups) / jnp.maximum(count, 1), 0.0)
+    first = reads.valid & (_first_of_channel(reads) == jnp.arange(reads.channel.shape[0]))
+    count, groups = (jnp.sum(flags.astype(reads.time_s.dtype)) for flags in (reads.valid, first))
+    return jnp.where(count > 0, (count - groups) / jnp.maximum(count, 1.0), 0.0)
 
 
 def coherent_score(
@@ -334,9 +335,10 @@ def coherent_score(
     upper = jnp.clip(jnp.searchsorted(time_s, reads.time_s), 1, time_s.shape[0] - 1)
     span = time_s[upper] - time_s[upper - 1]
     fraction = jnp.clip((reads.time_s - time_s[upper - 1]) / jnp.where(span > 0, span, 1.0), 0.0, 1.0)
-    distance = rho_m[..., upper - 1] * (1.0 - fraction) + rho_m[..., upper] * fraction
+    share = fraction[None, None]
+    distance = rho_m[..., upper - 1] * (1.0 - share) + rho_m[..., upper] * share
     residual = phase_residual(reads.phase_rad[None, None], reads.carrier_hz[None, None], distance)
-    weight = reads.valid / (jnp.square(reads.sigma_rad) + 0.1)
+    weight = reads.valid.astype(rho_m.dtype) / (jnp.square(reads.sigma_rad) + 0.1)
     return coherence(
         residual,
         weight[None, None],
@@ -361,8 +363,8 @@ def describe(
     divisor = jnp.maximum(total, 1e-6)
     x = jnp.sum(hard * jnp.arange(width, dtype=mask.dtype)[None, None], axis=(1, 2)) / divisor
     y = jnp.sum(hard * jnp.arange(height, dtype=mask.dtype)[None, :, None], axis=(1, 2)) / divisor
-    moving = mask * recent
-    change = jnp.sum(moving * step_m, axis=(1, 2)) / jnp.maximum(jnp.sum(moving, axis=(1, 2)), 1e-6)
+    moving = mask * recent.astype(mask.dtype)[None]
+    change = jnp.sum(moving * step_m[None], axis=(1, 2)) / jnp.maximum(jnp.sum(moving, axis=(1, 2)), 1e-6)
     return Trace(
         mask=mask,
         box_px=jax.vmap(lambda m: bounding_box(m, box_tail))(hard),

@@ -75,7 +75,8 @@ class TagAttentionPaper(AbstractTracer):
             )
             evidence = log_likelihood_ratio(jnp.where(full, att, 0.0), jnp.ones(()), jnp.asarray(FLOOR))
             known = jnp.all(jnp.isfinite(radio.std_m))
-            gate = velocity_gate(radio_speed(radio.relative_m, time_s), self.v0_m_s, 0.1 * width) * known
+            gate = velocity_gate(radio_speed(radio.relative_m, time_s), self.v0_m_s, 0.1 * width)
+            gate = gate * known.astype(gate.dtype)
             likelihood = propagate(carried, evidence, gate, self.forgetting)
             if self.refine:
                 pooled, _ = pool(segments, likelihood[..., None], valid.astype(likelihood.dtype))
@@ -84,9 +85,8 @@ class TagAttentionPaper(AbstractTracer):
             top = jnp.where(jnp.isfinite(top), top, 0.0)
             probability = min_max(jnp.exp(likelihood - top), valid)
             corner = cdf_corner(probability, valid, jnp.asarray(SIGNIFICANCE), 0.01 * width)
-            mask = jax.nn.sigmoid((probability - corner) / (0.1 * width)) * valid
-            varies = jnp.max(probability) > 0
-            return likelihood, mask * varies
+            mask = jax.nn.sigmoid((probability - corner) / (0.1 * width))
+            return likelihood, jnp.where(valid & (jnp.max(probability) > 0), mask, 0.0)
 
         likelihood, mask = jax.vmap(one_tag)(warped, frame.radio)
         total = jnp.maximum(jnp.sum(mask, axis=(1, 2)), 1e-6)

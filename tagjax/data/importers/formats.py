@@ -58,13 +58,13 @@ def _whole(row: Row, name: str) -> int:
 
 def clean_epc(text: str | None) -> str:
     """An EPC in upper-case hex: spaces and the b'...' of printed Python bytes are taken off."""
-    text = (text or "").strip()
-    if re.fullmatch(r"b(['\"]).*\1", text):
-        text = ast.literal_eval(text).decode("ascii", "replace")
-    text = re.sub(r"[\s-]", "", text).upper()
-    if not re.fullmatch(r"[0-9A-F]{4,}", text):
+    cleaned = (text or "").strip()
+    if re.fullmatch(r"b(['\"]).*\1", cleaned):
+        cleaned = ast.literal_eval(cleaned).decode("ascii", "replace")
+    cleaned = re.sub(r"[\s-]", "", cleaned).upper()
+    if not re.fullmatch(r"[0-9A-F]{4,}", cleaned):
         raise RowError("EPC is no hexadecimal number")
-    return text
+    return cleaned
 
 
 def stamp_ns(text: str | None) -> int:

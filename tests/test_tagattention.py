@@ -1,0 +1,193 @@
+"""The tracers: the paper's update step by step, the learnable one's gradients, determinism and degenerate input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic_clips as synthetic
+
+from tagjax.data.clips import load_clip
+from tagjax.motion import empty_motion, push_gather, push_splat
+from tagjax.rf.reads import RadioWindow
+from tagjax.tagattention import TagAttention
+from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
+from tagjax.tracer import Frame, trace
+
+
+def _learnable():
+    """For objects that move at a few dm/s and are seen without noise: a narrow kernel, a weak place prior."""
+    return TagAttention(cell=4, alpha_m2=1e-3, prior_weight=3.0)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return load_clip(synthetic.recording(24), 0, 24, stride=1)
+
+
+def _shapes(out, clip):
+    num_tags = len(clip.epcs)
+    time, height, width = clip.frames.depth_m.shape
+    assert out.mask.shape == (time, num_tags, height, width)
+    assert bool((out.mask >= 0).all() & (out.mask <= 1).all())
+    for leaf in jax.tree.leaves(out):
+        assert bool(jnp.isfinite(leaf).all())
+
+
+def test_the_learnable_tracer_finds_both_objects(clip):
+    out = eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
+    _shapes(out, clip)
+    for tag, (x0, y0, x1, y1) in enumerate(synthetic.BOXES.values()):
+        mask = np.asarray(out.mask[-1, tag]) > 0.5
+        inside = np.zeros_like(mask)
+        inside[y0 : y1 + 1, x0 : x1 + 1] = True
+        assert (mask & inside).sum() / (mask | inside).sum() > 0.6
+        assert bool(out.found[-1, tag])
+
+
+def test_step_follows_the_objects_distance(clip):
+    out = eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
+    time_s = np.asarray(clip.frames.time_s)
+    for tag, label in enumerate(synthetic.BOXES):
+        expected = np.diff(synthetic.offset_m(label, time_s))[-8:]
+        np.testing.assert_allclose(np.asarray(out.step_m[-8:, tag]), expected, atol=0.02)
+
+
+def test_tags_do_not_disturb_each_other(clip):
+    """Any number of tags by vmap: each is traced as if it were alone."""
+    both = eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
+    alone = load_clip(synthetic.recording(24), 0, 24, stride=1, epcs=[clip.epcs[1]])
+    single = eqx.filter_jit(trace)(_learnable(), alone.camera, alone.frames)
+    np.testing.assert_allclose(both.mask[:, 1], single.mask[:, 0], atol=1e-4)
+
+
+def test_scan_is_the_loop_of_steps(clip):
+    tracer = _learnable()
+    few = jax.tree.map(lambda leaf: leaf[:5], clip.frames)
+    scanned = eqx.filter_jit(trace)(tracer, clip.camera, few)
+    state = tracer.init(clip.camera, jax.tree.map(lambda leaf: leaf[0], few))
+    shapes = jax.tree.map(jnp.shape, state)
+    for t in range(5):
+        state, said = tracer.step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], few))
+        np.testing.assert_allclose(said.mask, scanned.mask[t], atol=1e-4)
+    assert jax.tree.map(jnp.shape, tracer.finish(state)) == shapes
+
+
+def test_every_parameter_gets_a_finite_gradient(clip):
+    tracer = _learnable()
+
+    def loss(tracer):
+        out = trace(tracer, clip.camera, clip.frames)
+        return jnp.sum(jnp.square(out.step_m[8:])) + jnp.mean(out.mask)
+
+    gradient = eqx.filter_jit(eqx.filter_grad(loss))(tracer)
+    silent = [
+        name
+        for name, leaf in vars(gradient).items()
+        if isinstance(leaf, jax.Array) and (not bool(jnp.isfinite(leaf)) or float(leaf) == 0.0)
+    ]
+    # Nothing here moves so that the prior's prediction ahead would differ.
+    assert set(silent) <= {"logit_inertia"}
+
+
+@pytest.mark.parametrize("tracer", [_learnable(), TagAttentionPaper(cell=4)], ids=["learnable", "paper"])
+@pytest.mark.parametrize("what", ["no depth", "no radio", "standing still"])
+def test_degenerate_input_stays_finite_with_its_gradient(clip, tracer, what):
+    frames = clip.frames
+    if what == "no depth":
+        frames = eqx.tree_at(lambda f: f.depth_m, frames, jnp.zeros_like(frames.depth_m))
+    elif what == "no radio":
+        nothing = RadioWindow(jnp.zeros_like(frames.radio.relative_m), jnp.full_like(frames.radio.std_m, jnp.inf))
+        frames = eqx.tree_at(lambda f: f.radio, frames, nothing)
+    else:
+        still = RadioWindow(jnp.zeros_like(frames.radio.relative_m), jnp.zeros_like(frames.radio.std_m))
+        frames = eqx.tree_at(lambda f: f.radio, frames, still)
+    frames = jax.tree.map(lambda leaf: leaf[:7], frames)
+
+    def total(tracer):
+        out = trace(tracer, clip.camera, frames)
+        return jnp.sum(out.mask) + jnp.sum(out.step_m), out
+
+    (_, out), gradient = eqx.filter_jit(eqx.filter_value_and_grad(total, has_aux=True))(tracer)
+    for leaf in (*jax.tree.leaves(out), *jax.tree.leaves(gradient)):
+        assert bool(jnp.isfinite(leaf).all())
+    if what == "no depth":
+        assert not out.found.any()
+
+
+def test_paper_update_is_equation_7(clip):
+    """Without the refinement, the likelihood is the running sum of gated log attentions, carried by the flow."""
+    tracer = TagAttentionPaper(refine=False)
+    frames = clip.frames
+    state = tracer.init(clip.camera, jax.tree.map(lambda leaf: leaf[0], frames))
+    rays = np.asarray(clip.camera.rays)
+    distance = np.linalg.norm(rays * np.asarray(frames.depth_m)[..., None], axis=-1)
+    expected = np.zeros(state.log_likelihood.shape)
+    for t in range(10):
+        state, _ = tracer.step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], frames))
+        for tag in range(2):
+            rd = np.asarray(frames.radio.relative_m[t, tag])
+            speed = abs(rd[-1] - rd[0]) / float(frames.time_s[t] - frames.time_s[max(t - 4, 0)] + 1e-12)
+            if not np.isfinite(np.asarray(frames.radio.std_m[t, tag])).all() or speed <= 0.1:
+                continue
+            if t < 4:
+                attention = np.zeros(distance.shape[1:])
+            else:
+                rho = distance[t - 4 : t + 1] - distance[t - 4]
+                rho = np.moveaxis(rho, 0, -1)
+                rbf = np.exp(-np.sum((rho - rd) ** 2, axis=-1) / (2 * 5e-4))
+                with np.errstate(invalid="ignore"):
+                    centred, other = rho - rho.mean(-1, keepdims=True), rd - rd.mean()
+                    norm = np.linalg.norm(centred, axis=-1) * np.linalg.norm(other)
+                    corr = np.where(norm > 1e-9, np.sum(centred * other, -1) / np.maximum(norm, 1e-9), 0)
+                attention = 0.8 * rbf + 0.2 * np.clip(corr, 0, 1)
+            expected[tag] += np.log(attention + FLOOR) - np.log1p(FLOOR)
+    still = np.abs(np.asarray(frames.forward_px)).max() < 1e-3
+    assert still
+    inner = np.s_[:, 2:-2, 2:-2]
+    np.testing.assert_allclose(np.asarray(state.log_likelihood)[inner], expected[inner], atol=0.2)
+
+
+def test_the_soft_tracer_has_the_paper_as_its_limit(clip):
+    frames = jax.tree.map(lambda leaf: leaf[:12], clip.frames)
+    # Without K-means, whose hard assignments tie in a scene seen through so long a lens.
+    paper = trace(TagAttentionPaper(refine=False), clip.camera, frames)
+    gaps = []
+    for softness in (0.3, 1e-2, 1e-7):
+        soft = trace(TagAttentionPaper(refine=False, softness=softness), clip.camera, frames)
+        gaps.append(float(jnp.mean(jnp.abs(soft.mask - paper.mask))))
+    assert gaps[2] < 1e-3
+    assert gaps[0] > gaps[2]
+
+
+def test_motion_maps_follow_a_shift_either_way():
+    """A textured plane that moves right by 2 px a frame: gather and splat carry the same past."""
+    rng = np.random.default_rng(0)
+    world = rng.uniform(1.0, 1.2, (10, 60)).astype(np.float32)
+    flow = jnp.broadcast_to(jnp.asarray([2.0, 0.0]), (10, 30, 2))
+    one, other = empty_motion(10, 30, 4), empty_motion(10, 30, 4)
+    for t in range(4):
+        seen = jnp.asarray(world[:, 20 - 2 * t : 50 - 2 * t])
+        one = push_splat(one, flow, seen)
+        other = push_gather(other, -flow, seen, jnp.asarray(0.5))
+    for motion in (one, other):
+        assert bool(motion.valid[:, 8:, :].all())
+        expected = jnp.broadcast_to(jnp.asarray(world[:, 14 + 8 : 44])[..., None], (10, 22, 4))
+        np.testing.assert_allclose(motion.distance_m[:, 8:], expected, atol=1e-5)
+        assert not motion.valid[:, :2, 2].any()
+
+
+def test_gathering_does_not_cross_a_depth_edge():
+    depth = jnp.where(jnp.arange(20) < 10, 1.0, 3.0)[None].repeat(6, axis=0)
+    motion = push_gather(empty_motion(6, 20, 3), jnp.zeros((6, 20, 2)), depth, jnp.asarray(0.3))
+    half = jnp.full((6, 20, 2), 0.5).at[..., 1].set(0.0)
+    moved = push_gather(motion, half, depth, jnp.asarray(0.3))
+    known = np.asarray(moved.valid[..., 1])
+    past = np.asarray(moved.distance_m[..., 1])
+    np.testing.assert_allclose(past[known], np.asarray(depth)[known], atol=1e-6)
+    assert known[:, 9].all()
+
+
+def test_only_frames_and_reads_enter(clip):
+    """A tracer's input holds no labels: what it says cannot depend on truth."""
+    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads"} == set(Frame.__dataclass_fields__)
