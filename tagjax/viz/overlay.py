@@ -20,6 +20,9 @@ PALETTE_RGB = (
 )
 """Colours of tags in their order, told apart on a dim room as well as on a bright one."""
 
+MIN_WIDTH = 480
+"""Smaller pictures are enlarged by a whole factor, so that outlines and names stay readable."""
+
 
 def draw_overlay(
     colour: UInt8[np.ndarray, "height width 3"],
@@ -31,9 +34,13 @@ def draw_overlay(
     *,
     true_boxes_px: Shaped[np.ndarray, "tag 4"] | None = None,
     caption: str = "",
-) -> UInt8[np.ndarray, "height width 3"]:
+) -> UInt8[np.ndarray, "picture_height picture_width 3"]:
     """RGB picture with each claimed object's tint, outline, box, name and confidence; true boxes thin and white."""
-    picture = np.ascontiguousarray(colour).copy()
+    scale = -(-MIN_WIDTH // colour.shape[1])
+    picture = np.ascontiguousarray(colour.repeat(scale, axis=0).repeat(scale, axis=1))
+    masks = masks.repeat(scale, axis=1).repeat(scale, axis=2)
+    boxes_px = boxes_px * scale
+    true_boxes_px = None if true_boxes_px is None else true_boxes_px * scale
     for tag, name in enumerate(names):
         shade = PALETTE_RGB[tag % len(PALETTE_RGB)]
         if true_boxes_px is not None and np.all(np.isfinite(true_boxes_px[tag])):
@@ -55,11 +62,17 @@ def draw_overlay(
 
 
 def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
-    # A dark rim under the letters keeps them readable on any background.
-    for colour, thickness in (((0, 0, 0), 3), (shade, 1)):
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+    # A dark rim under the letters keeps them readable on any background. Drawn shifted, not thicker: thicker letters
+    # are also wider.
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        _letters(picture, text, (place[0] + dx, place[1] + dy), (0, 0, 0))
+    _letters(picture, text, place, shade)
 
 
-def short_name(epc: str, length: int = 12) -> str:
+def _letters(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, shade, 1, cv2.LINE_AA)
+
+
+def short_name(epc: str, length: int = 6) -> str:
     """An EPC short enough for a picture: its end, which is where EPCs of one batch differ."""
     return epc if len(epc) <= length else f"..{epc[-length:]}"
