@@ -23,6 +23,7 @@ from tagjax.evaluation.evaluate import (
 from tagjax.evaluation.report import plain, score_table, summarise, write_report
 from tagjax.recording import RecordingError
 from tagjax.tracer import trace
+from tagjax.viz.overlay import MIN_WIDTH
 
 EPCS = list(synthetic.EPCS)
 
@@ -135,7 +136,8 @@ def test_report_is_complete(tmp_path: Path) -> None:
     assert len(pictures) == 3
     drawn = cv2.imread(str(pictures[-1]))
     assert drawn is not None
-    assert drawn.shape == (synthetic.HEIGHT, synthetic.WIDTH, 3)
+    scale = -(-MIN_WIDTH // synthetic.WIDTH)  # small pictures are enlarged
+    assert drawn.shape == (scale * synthetic.HEIGHT, scale * synthetic.WIDTH, 3)
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 3  # something is drawn on the uniform grey
     assert len(list((tmp_path / "curves").glob("*.png"))) == 2
     assert score_table(summary).row_count == 2
