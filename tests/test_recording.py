@@ -1,16 +1,27 @@
 """Recordings: round trip, laziness, and a clear answer to every kind of bad input."""
 
+import copy
 import dataclasses
+import functools
+import http.server
 import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
 import zarr
 
+from tagjax.data import flow_cache
 from tagjax.data.clips import clip_dataset, load_clip
 from tagjax.data.flow_cache import pair_flow
-from tagjax.data.store import open_recording, save_recording, write_recording
+from tagjax.data.store import StoredFrames, open_recording, save_recording, write_recording
+from tagjax.flow.opencv import make_flow
 from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads
 
 
@@ -37,8 +48,8 @@ def test_round_trip(recording, tmp_path):
     assert again.clock == audit
     assert again.truth.tag_to_label == dict(recording.truth.tag_to_label)
     np.testing.assert_array_equal(again.truth.tag_range_m["tag-a"], recording.truth.tag_range_m["tag-a"])
-    assert isinstance(again.colour, zarr.Array)
-    assert again.colour.chunks[0] == 1
+    assert isinstance(again.colour, StoredFrames)
+    assert again.colour.array.chunks[0] == 1
 
 
 def test_remote_store(recording):
@@ -49,6 +60,255 @@ def test_remote_store(recording):
     assert again.store is None
     np.testing.assert_array_equal(again.depth[3], recording.depth[3])
     fsspec.filesystem("memory").rm("/somewhere", recursive=True)
+
+
+def _complete(recording: Recording) -> Recording:
+    """A recording with every optional part."""
+    shape, count = recording.depth.shape, recording.reads.num_reads
+    truth = dataclasses.replace(
+        recording.truth,
+        flow_px=np.ones((*shape, 2), np.float32),
+        occluded=np.ones(shape, bool),
+        boxes_px=np.ones((shape[0], 2, 4), np.float32),
+    )
+    reads = dataclasses.replace(
+        recording.reads, reader_time_ns=recording.reads.time_ns + 5, channel_index=np.ones(count, np.int16)
+    )
+    return recording.with_reads(reads, truth)
+
+
+def test_every_optional_part_makes_the_round_trip(recording, tmp_path):
+    whole = _complete(recording)
+    save_recording(whole, tmp_path / "a.zarr")
+    again = open_recording(tmp_path / "a.zarr")
+    for name in ("labels", "flow_px", "occluded", "boxes_px"):
+        np.testing.assert_array_equal(getattr(again.truth, name)[...], getattr(whole.truth, name))
+    np.testing.assert_array_equal(again.reads.reader_time_ns, whole.reads.reader_time_ns)
+    np.testing.assert_array_equal(again.reads.channel_index, whole.reads.channel_index)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "truth/labels",
+        "truth/flow_px",
+        "truth/occluded",
+        "truth/boxes_px",
+        "truth/tag_range_m/0",
+        "reads/reader_time_ns",
+        "reads/channel_index",
+        "reads/phase_rad",
+    ],
+)
+def test_a_lost_array_is_an_error(recording, tmp_path, name):
+    save_recording(_complete(recording), tmp_path / "a.zarr")
+    shutil.rmtree(tmp_path / "a.zarr" / name)
+    with pytest.raises(RecordingError, match=f"array '{name}' is missing"):
+        open_recording(tmp_path / "a.zarr")
+
+
+def test_recordings_of_the_first_releases_list_no_arrays_and_still_open(recording, tmp_path):
+    save_recording(recording, tmp_path / "a.zarr")
+    del zarr.open_group(str(tmp_path / "a.zarr"), mode="r+").attrs["arrays"]
+    again = open_recording(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(again.truth.labels[3], recording.truth.labels[3])
+    assert again.truth.flow_px is None
+    assert again.reads.channel_index is None
+
+
+def _cut(file: Path, share: float = 0.5) -> None:
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize(
+    ("name", "chunk", "found"),
+    [
+        ("time_ns", "0", "'time_ns' cannot"),
+        ("reads/phase_rad", "0", "'reads/phase_rad' cannot"),
+        ("truth/tag_range_m/1", "0", "'truth/tag_range_m/1' cannot"),
+        ("depth", "6/0/0", "'depth', frame 6 cannot"),
+    ],
+)
+def test_a_shortened_file_is_found_when_it_is_read_at_opening(recording, tmp_path, name, chunk, found, share):
+    save_recording(recording, tmp_path / "a.zarr")
+    _cut(tmp_path / "a.zarr" / name / "c" / chunk, share)
+    with pytest.raises(RecordingError, match=f"a.zarr: array {found} be read"):
+        open_recording(tmp_path / "a.zarr")
+
+
+def test_a_shortened_or_altered_file_is_found_when_its_frame_is_asked_for(recording, tmp_path):
+    path = tmp_path / "a.zarr"
+    noisy = np.random.default_rng(0).integers(0, 255, recording.colour.shape).astype(np.uint8)
+    save_recording(dataclasses.replace(recording, colour=noisy), path)
+    _cut(path / "colour" / "c" / "5" / "0" / "0" / "0")
+    _cut(path / "truth" / "labels" / "c" / "2" / "0" / "0")
+    file = path / "colour" / "c" / "8" / "0" / "0" / "0"
+    altered = bytearray(file.read_bytes())
+    altered[len(altered) // 2] ^= 1
+    file.write_bytes(bytes(altered))
+    again = open_recording(path)
+    np.testing.assert_array_equal(again.colour[4], noisy[4])
+    np.testing.assert_array_equal(again.colour[-1], noisy[-1])
+    for index in (5, slice(3, 7), slice(None), (5, 3), (slice(4, 6), 3)):
+        with pytest.raises(RecordingError, match=r"a\.zarr: array 'colour', frame 5 cannot be read"):
+            again.colour[index]
+    with pytest.raises(RecordingError, match="'colour', frame 8 cannot be read"):
+        again.colour[8]
+    with pytest.raises(RecordingError, match="'truth/labels', frame 2 cannot be read"):
+        again.truth.labels[2]
+    with pytest.raises(RecordingError, match="'colour', frame 5 cannot be read"):
+        pair_flow(again, 0, 12, "dis_fast")
+    with pytest.raises(IndexError):
+        again.colour[12]
+
+
+def test_a_file_lost_after_opening_is_no_black_picture(recording, tmp_path):
+    save_recording(recording, tmp_path / "a.zarr")
+    again = open_recording(tmp_path / "a.zarr")
+    (tmp_path / "a.zarr" / "colour" / "c" / "7" / "0" / "0" / "0").unlink()
+    for index in (7, slice(6, 9), -5, [2, 7]):
+        with pytest.raises(RecordingError, match="'colour', frame 7 is missing"):
+            again.colour[index]
+    assert again.colour[6].any()
+
+
+def _unchecked(value, **changes):
+    """A copy with other fields, not checked as the tests' constructors do: programs that use tagjax go unchecked."""
+    changed = copy.copy(value)
+    for name, field in changes.items():
+        object.__setattr__(changed, name, field)
+    return changed
+
+
+def test_numpy_values_in_attributes_are_made_plain(recording, tmp_path):
+    lens = recording.intrinsics
+    odd = _unchecked(
+        recording,
+        intrinsics=_unchecked(
+            lens, fx_px=np.float32(lens.fx_px), width=np.int64(32), distortion=(np.float32(0.5), np.float64(0))
+        ),
+        clock=_unchecked(
+            ClockAudit(0.0, 2.0, float("nan"), 7, "unix"), offset_s=np.float32(1.5), num_reads=np.int64(7)
+        ),
+        name=np.str_("odd"),
+        reads=_unchecked(
+            recording.reads, hop_table_hz=np.array([9e8, 9.1e8]), pi_flips=np.bool_(True), phase_sign=np.int8(1)
+        ),
+        truth=_unchecked(
+            recording.truth,
+            tag_to_label={np.str_("tag-a"): np.int64(1), "tag-b": np.uint8(2)},
+            visible={np.int64(1): np.ones(12, bool)},
+        ),
+    )
+    save_recording(odd, tmp_path / "a.zarr")
+    again = open_recording(tmp_path / "a.zarr")
+    assert again.truth.tag_to_label == {"tag-a": 1, "tag-b": 2}
+    assert again.intrinsics == dataclasses.replace(lens, distortion=(0.5, 0.0))
+    assert again.clock.num_reads == 7
+    assert np.isnan(again.clock.residual_ms)
+    assert again.reads.hop_table_hz == (9e8, 9.1e8)
+    assert again.reads.pi_flips is True
+    assert again.name == "odd"
+    np.testing.assert_array_equal(again.truth.visible[1], np.ones(12, bool))
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "message"),
+    [
+        ("truth", {"tag_to_label": {"tag-a": {1, 2}}}, r"truth\['tag_to_label'\]\['tag-a'\] holds \{1, 2\} \(set\)"),
+        ("truth", {"tag_to_label": {3: 1}}, "the key 3; expected names"),
+        ("truth", {"visible": {1: np.array(["yes"])}}, "truth/visible/0 holds <U3"),
+        ("clock", {"offset_s": 1j}, r"clock\['offset_s'\] holds 1j"),
+        ("reads", {"antenna": np.array([None])}, "reads/antenna holds object"),
+        (None, {"source": Path("somewhere")}, "source holds PosixPath"),
+    ],
+)
+def test_what_cannot_be_stored_is_refused_before_any_frame_is_written(recording, tmp_path, part, change, message):
+    class Unread:
+        shape, dtype = recording.colour.shape, recording.colour.dtype
+
+        def __getitem__(self, index):
+            raise AssertionError("a frame was written")
+
+    recording = dataclasses.replace(recording, colour=Unread(), clock=ClockAudit(0.0, 0.0, 0.0, 1, "unix"))
+    changed = change if part is None else {part: _unchecked(getattr(recording, part), **change)}
+    with pytest.raises(RecordingError, match=message):
+        save_recording(_unchecked(recording, **changed), tmp_path / "a.zarr")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def web(tmp_path):
+    """A web server of the folder `tmp_path`: its address, the paths asked for, and a switch that makes it fail."""
+    pytest.importorskip("aiohttp")
+    asked: list[str] = []
+    broken = threading.Event()
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def send_head(self):
+            asked.append(self.path)
+            if broken.is_set():
+                self.send_error(500)
+                return None
+            return super().send_head()
+
+        def log_message(self, format, *args):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(tmp_path)))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}", asked, broken
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_a_web_server_serves_frames_as_they_are_asked_for(recording, tmp_path, web):
+    address, asked, broken = web
+    noisy = np.random.default_rng(0).integers(1, 255, recording.colour.shape).astype(np.uint8)
+    save_recording(dataclasses.replace(_complete(recording), colour=noisy), tmp_path / "a.zarr")
+    again = open_recording(f"{address}/a.zarr")
+    assert again.store is None
+    assert not any("/colour/c/" in path for path in asked)
+    np.testing.assert_array_equal(again.colour[4], noisy[4])
+    assert [path for path in asked if "/colour/c/" in path] == ["/a.zarr/colour/c/4/0/0/0"]
+    np.testing.assert_array_equal(again.truth.labels[0:3], recording.truth.labels[0:3])
+    np.testing.assert_array_equal(again.depth[3], recording.depth[3])
+    assert pair_flow(again, 0, 3, "dis_fast")[0].shape == (3, 24, 32, 2)
+    shutil.rmtree(tmp_path / "a.zarr" / "colour" / "c" / "5")
+    with pytest.raises(RecordingError, match="'colour', frame 5 is missing"):
+        again.colour[5]
+    broken.set()
+    with pytest.raises(RecordingError, match=r"http://.*a\.zarr: array 'colour', frame 6 cannot be read"):
+        again.colour[6]
+    with pytest.raises(RecordingError, match="'depth', frame 2 cannot be read"):
+        again.depth_metres(slice(2, 4))
+
+
+def test_a_web_address_without_a_recording_is_an_error(recording, tmp_path, web):
+    address, _, broken = web
+    with pytest.raises(RecordingError, match="no readable Zarr v3 group"):
+        open_recording(f"{address}/nowhere.zarr")
+    save_recording(_complete(recording), tmp_path / "a.zarr")
+    shutil.rmtree(tmp_path / "a.zarr" / "truth" / "flow_px")
+    with pytest.raises(RecordingError, match="'truth/flow_px' is missing"):
+        open_recording(f"{address}/a.zarr")
+    broken.set()
+    with pytest.raises(RecordingError, match=r"a\.zarr: no readable Zarr v3 group"):
+        open_recording(f"{address}/a.zarr")
+    with pytest.raises(RecordingError, match="no readable Zarr v3 group"):
+        open_recording("http://127.0.0.1:1/a.zarr")
+
+
+def test_a_missing_package_for_an_address_says_what_to_install(monkeypatch):
+    def absent(*args, **kwargs):
+        raise ImportError("HTTPFileSystem requires aiohttp")
+
+    monkeypatch.setattr(zarr, "open_group", absent)
+    with pytest.raises(RecordingError, match=r"tagjax\[remote\]"):
+        open_recording("https://example.org/a.zarr")
 
 
 def test_existing_folder_is_not_overwritten_and_a_failed_write_leaves_nothing(recording, tmp_path):
@@ -237,6 +497,180 @@ def test_flow_is_kept_with_the_recording(recording, tmp_path):
     assert not first[0][0].any()
     with pytest.raises(ValueError, match="Unknown optical flow"):
         pair_flow(recording, 0, 2, "magic")
+
+
+_CACHE = Path("cache", "flow", "dis_fast")
+
+
+@pytest.fixture
+def moving(recording, tmp_path) -> Recording:
+    """A stored recording whose pictures change, so that no flow is zero."""
+    rng = np.random.default_rng(3)
+    wall = rng.integers(0, 255, (12, 16, 3)).astype(np.uint8).repeat(6, 0).repeat(6, 1)
+    shift = [2 * t for t in range(12)]
+    colour = np.stack([np.roll(wall, s, axis=1) for s in shift])
+    lens = dataclasses.replace(recording.intrinsics, width=96, height=72)
+    depth = np.full((12, 72, 96), 2, np.float32)
+    save_recording(
+        dataclasses.replace(recording, colour=colour, depth=depth, intrinsics=lens, truth=None), tmp_path / "m.zarr"
+    )
+    return open_recording(tmp_path / "m.zarr")
+
+
+def _direct(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """The flow of a recording, computed without the cache."""
+    both = pair_flow(dataclasses.replace(recording, store=None), 0, recording.num_frames, "dis_fast")
+    return both[0].astype(np.float16).astype(np.float32), both[1].astype(np.float16).astype(np.float32)
+
+
+def _agrees(recording: Recording) -> None:
+    held, direct = pair_flow(recording, 0, recording.num_frames, "dis_fast"), _direct(recording)
+    for one, other in zip(held, direct, strict=True):
+        assert all(frame.any() for frame in other[1:])
+        np.testing.assert_array_equal(one, other)
+
+
+def test_kept_flow_is_what_is_computed_whatever_stretch_is_asked_for(moving):
+    direct = _direct(moving)
+    alone = pair_flow(dataclasses.replace(moving, store=None), 3, 5, "dis_fast")
+    for held, one, other in zip(pair_flow(moving, 3, 5, "dis_fast"), direct, alone, strict=True):
+        np.testing.assert_array_equal(held, one[3:5])
+        np.testing.assert_array_equal(other.astype(np.float16), one[3:5].astype(np.float16))
+    _agrees(moving)
+    assert not list((Path(moving.store.store.root) / _CACHE.parent).glob(".*"))
+
+
+def test_flow_is_written_frame_by_frame(moving, monkeypatch):
+    folder = Path(moving.store.store.root) / _CACHE.parent
+    behind = []
+
+    def watching(name):
+        flow = make_flow(name)
+
+        def compute(before, now):
+            written = [len(list(way.glob("c/*"))) for way in folder.glob(".*.partial/*ward")]
+            behind.append((len(behind) // 2 + 1, sorted(written)))
+            return flow(before, now)
+
+        return compute
+
+    monkeypatch.setattr(flow_cache, "make_flow", watching)
+    pair_flow(moving, 0, 2, "dis_fast")
+    assert behind == [(pair, [pair, pair]) for pair in range(1, 12) for _ in range(2)]
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_flow_leaves_the_recording_usable(moving, monkeypatch, stop):
+    def failing(name):
+        left = [make_flow(name)] * 9
+
+        def compute(before, now):
+            if not left:
+                raise stop
+            return left.pop()(before, now)
+
+        return compute
+
+    with monkeypatch.context() as patch:
+        patch.setattr(flow_cache, "make_flow", failing)
+        with pytest.raises(stop):
+            pair_flow(moving, 0, 12, "dis_fast")
+    assert not list((Path(moving.store.store.root) / _CACHE.parent).iterdir())
+    _agrees(open_recording(moving.store.store.root))
+
+
+_KILLED = """
+import os, signal, sys
+from tagjax.data import flow_cache
+from tagjax.data.store import open_recording
+
+def slow(name):
+    count = []
+    def compute(before, now):
+        count.append(1)
+        if len(count) == 9:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return make(name)(before, now)
+    return compute
+
+make, flow_cache.make_flow = flow_cache.make_flow, slow
+flow_cache.pair_flow(open_recording(sys.argv[1]), 0, 12, "dis_fast")
+"""
+
+
+def test_flow_of_a_killed_process_is_never_read_and_swept_later(moving, monkeypatch):
+    path = Path(moving.store.store.root)
+    killed = subprocess.run([sys.executable, "-c", _KILLED, str(path)], capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    (partial,) = (path / _CACHE.parent).iterdir()
+    _agrees(open_recording(path))
+    assert partial.is_dir()  # it could be of a process that is still at work
+    shutil.rmtree(path / _CACHE)
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 7200)
+    _agrees(open_recording(path))
+    assert not partial.exists()
+
+
+def test_flow_of_other_shape_or_version_or_without_its_mark_is_computed_again(moving):
+    path = Path(moving.store.store.root)
+    _agrees(moving)
+    for change in ({"version": 0}, {"complete": False}, {"shape": [11, 72, 96, 2]}, None):
+        group = zarr.open_group(str(path / _CACHE), mode="r+")
+        group["forward"][:] = 7  # type: ignore[index]
+        group.attrs.update(change) if change else group.attrs.clear()
+        _agrees(open_recording(path))
+    group = zarr.open_group(str(path / _CACHE), mode="r+")
+    for way in ("forward", "backward"):  # arrays that do not fit the pictures
+        del group[way]
+        group.create_array(way, data=np.ones((12, 5, 5, 2), np.float16), chunks=(1, 5, 5, 2))
+    _agrees(open_recording(path))
+
+
+def test_damaged_flow_is_computed_again(moving):
+    path = Path(moving.store.store.root)
+    _agrees(moving)
+    chunk = path / _CACHE / "backward" / "c" / "7" / "0" / "0" / "0"
+    _cut(chunk)
+    _agrees(moving)
+    chunk.unlink()
+    _agrees(moving)
+    shutil.rmtree(path / _CACHE / "forward")
+    _agrees(moving)
+    assert sorted(file.name for file in (path / _CACHE.parent).iterdir()) == ["dis_fast"]
+
+
+def test_two_that_fill_at_once_agree(moving, monkeypatch):
+    path = Path(moving.store.store.root)
+    meet = threading.Barrier(2, timeout=30)
+    write = flow_cache._fill
+
+    def together(*args):
+        meet.wait()
+        write(*args)
+
+    monkeypatch.setattr(flow_cache, "_fill", together)
+    found: list = []
+    threads = [
+        threading.Thread(target=lambda: found.append(pair_flow(open_recording(path), 0, 12, "dis_fast")))
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 2
+    for both in found:
+        for one, other in zip(both, _direct(moving), strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert [file.name for file in (path / _CACHE.parent).iterdir()] == ["dis_fast"]
+
+
+def test_pictures_replaced_after_opening_have_a_flow_of_their_own(moving):
+    _agrees(moving)
+    still = dataclasses.replace(moving, colour=np.zeros(moving.colour.shape, np.uint8))
+    assert not pair_flow(still, 0, 12, "dis_fast")[0].any()
+    _agrees(moving)
 
 
 def test_the_clip_stream_is_shuffled_by_seed_and_resumes_exactly(recording):

@@ -3,60 +3,145 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import shutil
+import time
+import uuid
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import zarr
 from rich.progress import track
+from zarr.storage import LocalStore
 
-from ..flow.opencv import make_flow, to_gray
-from ..recording import Recording
-from .store import write_frames
+from ..flow.opencv import FlowFunction, make_flow, to_gray
+from ..recording import Recording, RecordingError
+from .store import StoredFrames, create_array
 
 _FOLDER = "cache/flow"
+_VERSION = 1
+"""To be raised when the same name gives another flow: older caches are then computed again."""
+
+_ABANDONED_S = 3600.0
+"""A partial cache that nothing was added to for so long is of a process that was killed."""
+
+_WAYS = ("forward", "backward")
 
 
 def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Flow between frames t - 1 and t for t = first .. last - 1: (forward on t - 1, backward on t).
 
     Both float32 (frames, height, width, 2), pixels of the full picture; zero where there is no frame before. The flow
-    of the whole recording is computed on the first call and kept: in its Zarr group where that can be written, under
-    `cache/flow/<method>/`, in half precision; otherwise only the frames asked for are computed.
+    of the whole recording is computed on the first call and kept in half precision in its folder, under
+    `cache/flow/<method>/`, where that can be written; otherwise only the frames asked for are computed.
     """
     if first < 0 or last > recording.num_frames or first >= last:
         raise ValueError(f"Frames {first} to {last} asked for; {recording.name} has {recording.num_frames}.")
-    if recording.store is not None:
-        forward, backward = (f"{_FOLDER}/{method}/{way}" for way in ("forward", "backward"))
-        if backward not in recording.store:
-            _fill(recording, method, forward, backward)
-        return tuple(np.asarray(recording.store[name][first:last], np.float32) for name in (forward, backward))  # type: ignore[return-value]
     flow = make_flow(method)
-    pairs = [_pair(recording, t, flow) for t in range(first, last)]
-    return np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
+    folder = _folder(recording, method)
+    if folder is None:
+        pairs = list(_pairs(recording, first, last, flow))
+        return np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
+    held = _read(recording, folder, method, first, last)
+    if held is None:
+        _clear(folder)
+        _fill(recording, folder, method, flow)
+        held = _read(recording, folder, method, first, last)
+    if held is None:
+        raise RecordingError(
+            f"{folder}: the flow was written but cannot be read back. Remove the folder and look to the disk."
+        )
+    return held
 
 
-def _pair(recording: Recording, t: int, flow) -> tuple[np.ndarray, np.ndarray]:
-    if t == 0:
-        zero = np.zeros((*recording.image_shape, 2), np.float32)
-        return zero, zero
-    before, now = (to_gray(np.asarray(recording.colour[frame])) for frame in (t - 1, t))
-    return flow(before, now), flow(now, before)
+def _folder(recording: Recording, method: str) -> Path | None:
+    """Where the flow of a recording is kept; None for a recording without a folder, or with other pictures in it."""
+    root, colour = recording.store, recording.colour
+    if not isinstance(root, zarr.Group) or not isinstance(root.store, LocalStore):
+        return None
+    # Pictures that were replaced after opening have a flow of their own.
+    if not isinstance(colour, StoredFrames) or colour.array.store_path != root.store_path / "colour":
+        return None
+    return Path(root.store.root) / root.path / _FOLDER / method
 
 
-def _fill(recording: Recording, method: str, forward: str, backward: str) -> None:
-    flow = make_flow(method)
-    shape = (recording.num_frames, *recording.image_shape, 2)
-    held: list[np.ndarray] = []
+def _told(recording: Recording, method: str) -> dict[str, Any]:
+    """The attributes of a complete cache. They are written last, and a cache with others is none."""
+    return {"complete": True, "version": _VERSION, "method": method, "shape": [*recording.colour.shape[:3], 2]}
 
-    def pairs():
-        for t in track(range(recording.num_frames), description=f"{recording.name}: {method} flow", transient=True):
-            ahead, back = _pair(recording, t, flow)
-            held.append(back.astype(np.float16))
-            yield ahead.astype(np.float16)
 
-    # `backward` is written last: while it is missing the cache counts as empty.
+def _read(recording: Recording, folder: Path, method: str, first: int, last: int):
+    """The flow of some frames from the cache; None if there is none, or not all of it."""
+    if not folder.is_dir():
+        return None
+    told = _told(recording, method)
     try:
-        write_frames(recording.store, forward, pairs(), shape, np.float16)
-        write_frames(recording.store, backward, iter(held), shape, np.float16)
-    except BaseException:
-        with contextlib.suppress(KeyError):
-            del recording.store[backward]
+        group = zarr.open_group(str(folder), mode="r", zarr_format=3)
+        if dict(group.attrs) != told:
+            return None
+        frames = []
+        for way in _WAYS:
+            stored = StoredFrames(group[way], str(folder), way)  # type: ignore[arg-type]
+            if list(stored.shape) != told["shape"]:
+                return None
+            frames.append(stored[first:last].astype(np.float32))
+    except MemoryError:
         raise
+    # A cache can be computed again, so any damage to it is as good as its absence.
+    except Exception:
+        return None
+    return frames[0], frames[1]
+
+
+def _pairs(recording: Recording, first: int, last: int, flow: FlowFunction):
+    before = None
+    for t in range(max(first - 1, 0), last):
+        now = to_gray(np.asarray(recording.colour[t]))
+        if t == 0 and first == 0:
+            zero = np.zeros((*now.shape, 2), np.float32)
+            yield zero, zero
+        elif before is not None:
+            yield flow(before, now), flow(now, before)
+        before = now
+
+
+def _fill(recording: Recording, folder: Path, method: str, flow: FlowFunction) -> None:
+    """Write the flow of every frame.
+
+    Each process fills a folder of its own, which takes the cache's name when it is whole: whoever comes second finds
+    the name taken and drops its own copy. A process that is killed leaves a partial folder that is never read.
+    """
+    partial = folder.with_name(f".{method}.{uuid.uuid4().hex}.partial")
+    told = _told(recording, method)
+    shape = (*recording.colour.shape[:3], 2)
+    try:
+        group = zarr.open_group(str(partial), mode="w", zarr_format=3)
+        targets = [create_array(group, way, shape, np.float16, per_frame=True) for way in _WAYS]
+        pairs = _pairs(recording, 0, shape[0], flow)
+        for t, pair in enumerate(
+            track(pairs, description=f"{recording.name}: {method} flow", total=shape[0], transient=True)
+        ):
+            for target, field in zip(targets, pair, strict=True):
+                target[t] = field.astype(np.float16)
+        group.attrs.update(told)
+        # The name is taken if another process was faster: its copy is as good.
+        with contextlib.suppress(OSError):
+            os.rename(partial, folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _clear(folder: Path) -> None:
+    """Take away a cache that cannot be used, and what killed processes left beside it."""
+    if folder.exists():
+        aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
+        # Moved first, so that nobody reads it while it goes; another process may have moved it already.
+        with contextlib.suppress(FileNotFoundError):
+            os.rename(folder, aside)
+        shutil.rmtree(aside, ignore_errors=True)
+    for partial in folder.parent.glob(".*.partial"):
+        with contextlib.suppress(OSError):
+            newest = max(path.stat().st_mtime for path in (partial, *partial.glob("*/c")))
+            if time.time() - newest > _ABANDONED_S:
+                shutil.rmtree(partial, ignore_errors=True)

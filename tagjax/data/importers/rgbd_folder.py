@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 import scipy.io
 
-from ...geometry import register_depth
+from ...geometry import register_depth, undistort
 from ...recording import Intrinsics, Recording, RecordingError, TagReads, Truth
 
 
@@ -49,9 +50,16 @@ class FrameFiles:
         self.shape = (len(self._files), *shape)
         self.dtype = np.dtype(dtype)
 
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype)
+
     def __getitem__(self, index: Any, /) -> np.ndarray:
         if isinstance(index, slice):
-            return np.stack([self[i] for i in range(*index.indices(len(self._files)))])
+            frames = [self[i] for i in range(*index.indices(len(self._files)))]
+            return np.stack(frames) if frames else np.empty((0, *self.shape[1:]), self.dtype)
         path = self._files[int(index)]
         frame = self._decode(path)
         if frame.shape != self.shape[1:]:
@@ -59,39 +67,102 @@ class FrameFiles:
         return frame
 
 
-def read_colour(path: Path) -> np.ndarray:
-    """An RGB picture, uint8 (height, width, 3)."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise RecordingError(f"{path}: no readable picture (cut short?). Copy it again.")
-    return picture[..., ::-1]
+def _jpeg_is_whole(data: bytes) -> bool:
+    """Whether the end-of-image marker follows the pixels. A thumbnail in the header has an end of its own."""
+    place = 2
+    while place + 4 <= len(data) and data[place] == 0xFF:
+        kind = data[place + 1]
+        if kind == 0xFF:  # padding
+            place += 1
+            continue
+        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        if kind == 0xDA:  # start of scan: from here FF is followed by 0 or a restart number, up to the end
+            return data.find(b"\xff\xd9", place) >= 0
+    return False
 
 
-def read_labels(path: Path) -> np.ndarray:
-    """A label picture, uint8 (height, width)."""
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+def _png_is_whole(data: bytes) -> bool:
+    """Whether every block is there, up to IEND, with its checksum."""
+    place = 8
+    while place + 12 <= len(data):
+        size = int.from_bytes(data[place : place + 4], "big")
+        kind, end = data[place + 4 : place + 8], place + 8 + size
+        if zlib.crc32(data[place + 4 : end]) != int.from_bytes(data[end : end + 4], "big") or end + 4 > len(data):
+            return False
+        if kind == b"IEND":
+            return True
+        place = end + 4
+    return False
+
+
+def _read_picture(path: Path, flags: int) -> np.ndarray:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error}). Is the folder complete?") from error
+    # OpenCV fills what is missing of a picture with grey and says nothing.
+    cut = (data[:2] == b"\xff\xd8" and not _jpeg_is_whole(data)) or (
+        data[:8] == b"\x89PNG\r\n\x1a\n" and not _png_is_whole(data)
+    )
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and not cut else None
+    except cv2.error:
+        picture = None
     if picture is None:
-        raise RecordingError(f"{path}: no readable picture (cut short?). Copy it again.")
+        found = "the picture is cut short or damaged" if cut else f"no readable picture ({len(data)} bytes)"
+        raise RecordingError(f"{path}: {found}; expected a whole JPEG or PNG file. Copy it again.")
     return picture
 
 
+def read_colour(path: Path) -> np.ndarray:
+    """An RGB picture, uint8 (height, width, 3). One that is cut short raises `RecordingError`."""
+    return _read_picture(path, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def read_labels(path: Path) -> np.ndarray:
+    """A label picture, uint8 (height, width). One that is cut short raises `RecordingError`."""
+    return _read_picture(path, cv2.IMREAD_GRAYSCALE)
+
+
 def read_mat_depth(path: Path) -> np.ndarray:
-    """`depth_array` of a MATLAB file, uint16 millimetres."""
+    """`depth_array` of a MATLAB file, uint16 (height, width) millimetres. Anything else raises `RecordingError`."""
+    depth = _load_mat(path, "depth_array")
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise RecordingError(
+            f"{path}: depth_array is {depth.dtype} of shape {depth.shape}; expected uint16 millimetres of shape (height, "
+            "width). Convert it."
+        )
+    return depth
+
+
+def _load_mat(path: str | Path, name: str) -> np.ndarray:
     try:
-        depth = scipy.io.loadmat(path)["depth_array"]
-    except (KeyError, ValueError, OSError, TypeError, NotImplementedError) as error:
-        raise RecordingError(f"{path}: no readable depth_array ({error}). Copy it again.") from error
-    return np.asarray(depth)
+        told = scipy.io.loadmat(path, variable_names=[name])
+    # A file that is cut short makes SciPy raise nearly anything (zlib.error, TypeError, struct.error, ...).
+    except Exception as error:
+        raise RecordingError(
+            f"{path}: no readable MATLAB file ({type(error).__name__}: {error}). Copy it again; save it with -v7 if it is "
+            "of version 7.3."
+        ) from error
+    if name not in told:
+        raise RecordingError(f"{path}: no variable {name!r}. Was the copy cut short, or is this another file?")
+    return np.asarray(told[name])
 
 
 def load_calibration(path: str | Path, shape: tuple[int, int]) -> DepthToColour:
-    """Kdepth, Krgb, R, T of a `cam_params` structure; a translation in millimetres is turned into metres."""
+    """Kdepth, Krgb, R, T of a `cam_params` structure; a translation in millimetres is turned into metres.
+
+    Raises `RecordingError` for a file without them.
+    """
+    told = _load_mat(path, "cam_params")
     try:
-        told = scipy.io.loadmat(path)["cam_params"][0, 0]
-        depth, colour, rotation = (np.asarray(told[name], float) for name in ("Kdepth", "Krgb", "R"))
+        told = told[0, 0]
+        depth, colour, rotation = (np.asarray(told[name], float).reshape(3, 3) for name in ("Kdepth", "Krgb", "R"))
         translation = np.asarray(told["T"], float).reshape(3)
-    except (KeyError, ValueError, OSError, IndexError) as error:
-        raise RecordingError(f"{path}: no cam_params with Kdepth, Krgb, R and T ({error}).") from error
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise RecordingError(
+            f"{path}: cam_params lacks something ({error}); expected Kdepth, Krgb and R, 3 x 3, and T, 3 numbers."
+        ) from error
     if np.linalg.norm(translation) > 1.0:
         translation = translation / 1000.0
     height, width = shape
@@ -124,7 +195,10 @@ def import_jpg_mat(
     depths = [picture.with_suffix(".mat") for picture in pictures]
     absent = [depth.name for depth in depths if not depth.is_file()]
     if absent:
-        raise RecordingError(f"{folder}: {len(absent)} pictures have no depth ({', '.join(absent[:3])} ...).")
+        raise RecordingError(
+            f"{folder}: {len(absent)} of {len(pictures)} pictures have no depth beside them (no {', '.join(absent[:3])}"
+            f"{', ...' if len(absent) > 3 else ''}). Copy the missing files or remove those pictures."
+        )
     if not np.isfinite(fps) or fps <= 0:
         raise RecordingError(f"fps is {fps}; expected a positive frame rate.")
     first = read_colour(pictures[0])
@@ -133,7 +207,12 @@ def import_jpg_mat(
         view = view.corrected(correction)
 
     def registered(path: Path) -> np.ndarray:
-        metres = read_mat_depth(path).astype(np.float32) * np.float32(1e-3)
+        depth = read_mat_depth(path)
+        if depth.shape != first.shape[:2]:
+            raise RecordingError(
+                f"{path}: depth of shape {depth.shape}; expected {first.shape[:2]} as the pictures, which the calibration is for."
+            )
+        metres = depth.astype(np.float32) * np.float32(1e-3)
         out = register_depth(metres, view.depth_camera, view.colour_camera, view.rotation, view.translation_m)
         return np.rint(out * 1000).astype(np.uint16)
 
@@ -162,14 +241,16 @@ TUM_INTRINSICS = {
 }
 """fx, fy, cx, cy, distortion of the TUM RGB-D benchmark's colour cameras."""
 
+TUM_SHAPE = (480, 640)
+
 TUM_UNITS_PER_M = 5000.0
 
 
 def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: float = 0.02) -> Recording:
     """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each picture with its nearest depth.
 
-    The camera is told by the folder's name if not given. Pictures without depth within `max_gap_s` are left out, and
-    how many is said in the recording's source.
+    The camera is told by the folder's name if not given; its lens distortion is undone frame by frame. Pictures without
+    depth within `max_gap_s` are left out, and how many is said in the recording's source. Raises `RecordingError`.
     """
     folder = Path(folder)
     listings = {kind: _tum_listing(folder / f"{kind}.txt") for kind in ("rgb", "depth")}
@@ -189,23 +270,41 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
             dropped += 1
     if not pairs:
         raise RecordingError(f"{folder}: no picture has a depth map within {max_gap_s} s. Are both lists of one clock?")
+    absent = [path for _, *both in pairs for path in both if not path.is_file()]
+    if absent:
+        raise RecordingError(f"{folder}: {len(absent)} listed files are missing, first {absent[0]}. Copy them again.")
     shape = read_colour(pairs[0][1]).shape
+    if shape[:2] != TUM_SHAPE:
+        raise RecordingError(
+            f"{pairs[0][1]}: a picture of {shape[:2]}; expected {TUM_SHAPE}, which TUM's intrinsics are for."
+        )
     fx, fy, cx, cy, distortion = TUM_INTRINSICS[chosen]
+    lens = Intrinsics(fx, fy, cx, cy, shape[1], shape[0], distortion)
+
+    def colour(path: Path) -> np.ndarray:
+        picture = read_colour(path)
+        if not distortion or picture.shape != shape:  # another shape is refused with the file's name
+            return picture
+        return undistort(picture, np.zeros(shape[:2], np.float32), lens)[0]
 
     def depth_mm(path: Path) -> np.ndarray:
-        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if raw is None or raw.dtype != np.uint16:
-            raise RecordingError(f"{path}: no readable 16-bit depth picture. Copy it again.")
-        return np.rint(raw * (1000.0 / TUM_UNITS_PER_M)).astype(np.uint16)
+        raw = _read_picture(path, cv2.IMREAD_UNCHANGED)
+        if raw.dtype != np.uint16 or raw.ndim != 2:
+            raise RecordingError(f"{path}: {raw.dtype} of shape {raw.shape}; expected a 16-bit grey depth picture.")
+        depth = np.rint(raw * (1000.0 / TUM_UNITS_PER_M)).astype(np.float32)
+        if distortion and depth.shape == shape[:2]:
+            depth = undistort(np.zeros(shape, np.uint8), depth, lens)[1]
+        return depth.astype(np.uint16)
 
+    undone = f"; lens distortion of {chosen} undone" if distortion else ""
     return Recording(
-        colour=FrameFiles([p for _, p, _ in pairs], read_colour, shape, np.uint8),
+        colour=FrameFiles([p for _, p, _ in pairs], colour, shape, np.uint8),
         depth=FrameFiles([d for _, _, d in pairs], depth_mm, shape[:2], np.uint16),
         time_ns=np.array([round(stamp * 1e9) for stamp, _, _ in pairs], np.int64),
-        intrinsics=Intrinsics(fx, fy, cx, cy, shape[1], shape[0], distortion),
+        intrinsics=dataclasses.replace(lens, distortion=()),
         reads=TagReads.empty(),
         name=folder.name,
-        source=f"TUM RGB-D {folder.name}; {dropped} pictures without depth left out",
+        source=f"TUM RGB-D {folder.name}; {dropped} of {len(listings['rgb'])} pictures without depth left out{undone}",
     )
 
 
