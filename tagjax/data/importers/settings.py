@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ...recording import Recording, RecordingError
 from ...sim.reader import ReaderSettings
 from ...sim.virtual_tag import attach_virtual_tags, load_tracks_csv
 from ..store import save_recording
+from .registration import estimate_folder_correction
 from .rgbd_folder import import_jpg_mat, import_tum
 from .tables import ImportReport, import_table
 
@@ -24,7 +25,7 @@ class ImportSettings:
     video: str | None = None
     video_format: str = "auto"  # tum | jpg_mat | auto
     calibration: str | None = None  # jpg_mat: .mat with cam_params
-    correction: tuple[float, ...] | None = None  # residual correction of the calibration, 7 numbers
+    correction: Any = None  # jpg_mat: residual correction of the calibration: null | 7 numbers | estimate
     masks: str | None = None  # jpg_mat: folder of label pictures
     fps: float = 30.0  # jpg_mat: its folder holds no times
     reads: str | None = None
@@ -60,7 +61,7 @@ def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[s
         said += _table_lines(report, reads)
     if settings.video is None:
         return None, said
-    recording = _video(settings)
+    recording = _video(settings, said)
     recording = dataclasses.replace(recording, antennas_m=np.asarray(settings.antennas_m, float))
     if table is not None:
         recording = dataclasses.replace(recording, reads=table[0], clock=table[1])
@@ -79,7 +80,7 @@ def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[s
     return recording, said
 
 
-def _video(settings: ImportSettings) -> Recording:
+def _video(settings: ImportSettings, said: list[str]) -> Recording:
     assert settings.video is not None
     folder = Path(settings.video)
     if not folder.is_dir():
@@ -88,15 +89,44 @@ def _video(settings: ImportSettings) -> Recording:
     if chosen == "auto":
         chosen = "tum" if (folder / "rgb.txt").is_file() else "jpg_mat"
     if chosen == "tum":
+        if settings.correction is not None:
+            raise RecordingError("correction is for a folder of .jpg and .mat; TUM RGB-D is registered already.")
         return import_tum(folder)
     if chosen != "jpg_mat":
         raise RecordingError(f"video_format={chosen}: expected auto, tum or jpg_mat.")
     if settings.calibration is None:
         raise RecordingError("A folder of .jpg and .mat needs its calibration: give calibration=<file.mat>.")
-    correction: Sequence[float] | None = settings.correction
-    if correction is not None and len(correction) != 7:
-        raise RecordingError(f"correction has {len(correction)} numbers; expected 7 (dTx dTy dTz fx* fy* cx+ cy+).")
-    return import_jpg_mat(folder, settings.calibration, fps=settings.fps, correction=correction, masks=settings.masks)
+    given = _correction(settings.correction)
+    plain = import_jpg_mat(folder, settings.calibration, fps=settings.fps, masks=settings.masks)
+    if given is None:
+        return plain
+    if given == "estimate":
+        found = estimate_folder_correction(folder, settings.calibration)
+        said.append(found.line())
+        correction, how = found.correction, "estimated"
+    else:
+        correction, how = given, "given"
+    corrected = import_jpg_mat(
+        folder, settings.calibration, fps=settings.fps, correction=correction, masks=settings.masks
+    )
+    # Told in full, so that the same recording can be made again without estimating.
+    numbers = ", ".join(f"{value:.8g}" for value in correction)
+    return dataclasses.replace(corrected, source=f"{corrected.source}; correction = [{numbers}] ({how})")
+
+
+def _correction(value: Any) -> Literal["estimate"] | tuple[float, ...] | None:
+    if value is None or value == "estimate":
+        return value
+    wrong = RecordingError(f"correction={value!r}: expected null, estimate or 7 numbers (dTx dTy dTz fx* fy* cx+ cy+).")
+    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 7:
+        raise wrong
+    try:
+        numbers = tuple(float(number) for number in value)
+    except (TypeError, ValueError):
+        raise wrong from None
+    if not np.all(np.isfinite(numbers)):
+        raise wrong
+    return numbers
 
 
 def _table_lines(report: ImportReport, reads) -> list[str]:
