@@ -1,6 +1,6 @@
 """Top-down attention (TagAttention, Eqs. 4-6): how well each pixel's motion agrees with the tag's.
 
-All functions take one pixel's motion vector with leading batch axes, and the validity of its samples; with every
+Those of the paper take one pixel's motion vector with leading batch axes, and the validity of its samples; with every
 sample valid they are the paper's equations to the letter.
 """
 
@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ._numerics import safe_divide, safe_sqrt
+from .rf.coherence import coherence, phase_residual
+from .rf.reads import PhaseReads
 
 
 def centre_first(
@@ -65,3 +67,40 @@ def attention(
 ) -> Float[Array, "*batch"]:
     """Att_RF = beta Att_rbf + (1 - beta) Att_corr (Eq. 6)."""
     return beta * rbf + (1.0 - beta) * corr
+
+
+def _first_of_channel(reads: PhaseReads) -> Array:
+    """Reads grouped by channel within the buffer: each read's group is the index of the channel's first read."""
+    same = reads.channel[:, None] == reads.channel[None, :]
+    return jnp.argmax(same & reads.valid[None, :], axis=1)
+
+
+def read_support(reads: PhaseReads) -> Float[Array, ""]:
+    """Share of the reads left once every channel has spent one on its unknown offset; 0 without reads."""
+    first = reads.valid & (_first_of_channel(reads) == jnp.arange(reads.channel.shape[0]))
+    count, groups = (jnp.sum(flags.astype(reads.time_s.dtype)) for flags in (reads.valid, first))
+    return jnp.where(count > 0, (count - groups) / jnp.maximum(count, 1.0), 0.0)
+
+
+def coherent_score(
+    rho_m: Float[Array, "rows columns window"],
+    reads: PhaseReads,
+    time_s: Float[Array, " window"],
+    *,
+    doubled_angle: bool,
+) -> Float[Array, "rows columns"]:
+    """Coherence of raw reads with motion known at frame times, linear in between; in [0, 1]."""
+    upper = jnp.clip(jnp.searchsorted(time_s, reads.time_s), 1, time_s.shape[0] - 1)
+    span = time_s[upper] - time_s[upper - 1]
+    fraction = jnp.clip((reads.time_s - time_s[upper - 1]) / jnp.where(span > 0, span, 1.0), 0.0, 1.0)
+    share = fraction[None, None]
+    distance = rho_m[..., upper - 1] * (1.0 - share) + rho_m[..., upper] * share
+    residual = phase_residual(reads.phase_rad[None, None], reads.carrier_hz[None, None], distance)
+    weight = reads.valid.astype(rho_m.dtype) / (jnp.square(reads.sigma_rad) + 0.1)
+    return coherence(
+        residual,
+        weight[None, None],
+        _first_of_channel(reads)[None, None],
+        num_channels=reads.channel.shape[0],
+        multiple=2 if doubled_angle else 1,
+    )

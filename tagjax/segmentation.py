@@ -219,6 +219,50 @@ def mean_shift(
     return centre
 
 
+def cdf_cut(
+    log_likelihood: Float[Array, "height width"],
+    valid: Bool[Array, "height width"],
+    significance: Float[Array, ""],
+    width: Float[Array, ""],
+) -> Float[Array, "height width"]:
+    """The paper's mask (III.G): min-max normalised exp(l), cut at the last corner of its CDF; hard as width -> 0.
+
+    `width` is the softness of the corner; the mask's edge is ten times as soft. Nothing varies: an empty mask.
+    """
+    top = jnp.max(jnp.where(valid, log_likelihood, -jnp.inf))
+    top = jnp.where(jnp.isfinite(top), top, 0.0)
+    probability = min_max(jnp.exp(jnp.where(valid, log_likelihood - top, 0.0)), valid)
+    corner = cdf_corner(probability, valid, significance, width)
+    mask = jax.nn.sigmoid((probability - corner) / (10.0 * width))
+    return jnp.where(valid & (jnp.max(probability) > 0), mask, 0.0)
+
+
+def compact_cut(
+    points_m: Float[Array, "height width 3"],
+    valid: Bool[Array, "height width"],
+    log_odds: Float[Array, "height width"],
+    *,
+    level: Float[Array, ""],
+    margin: Float[Array, ""],
+    width: Float[Array, ""],
+    extent_m: Float[Array, ""],
+) -> tuple[Float[Array, "height width"], Float[Array, " 3"]]:
+    """A soft mask that is one compact thing in 3D, and its centre.
+
+    The mask is sigmoid((l - threshold - |p - c|^2 / (2 extent^2)) / width) with threshold = min(level, best - margin),
+    where c is the mode (mean shift) of the points whose l passes, started at the best of them.
+    """
+    best = jnp.max(jnp.where(valid, log_odds, -1e3))
+    threshold = jnp.minimum(level, best - margin)
+    known = valid.astype(log_odds.dtype)
+    weight = jax.nn.sigmoid((log_odds - threshold) / width) * known
+    peak = jnp.where(valid, jnp.exp(jnp.minimum(log_odds - best, 0.0) / width), 0.0)
+    start = jnp.sum(points_m * peak[..., None], axis=(0, 1)) / jnp.maximum(jnp.sum(peak), 1e-6)
+    centre = mean_shift(points_m, weight, start, extent_m)
+    spread = jnp.sum(jnp.square(points_m - centre[None, None]), axis=-1) / (2.0 * jnp.square(extent_m))
+    return jax.nn.sigmoid((log_odds - threshold - spread) / width) * known, centre
+
+
 def bounding_box(mask: Float[Array, "height width"], tail: float) -> Float[Array, " 4"]:
     """Box x0 y0 x1 y1 (pixel edges) that leaves at most the share `tail` of the mask outside on each side.
 

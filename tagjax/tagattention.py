@@ -2,11 +2,16 @@
 
 Per frame: the motion map slides (Eq. 3); pixels are grouped into 3D segments; attention compares each one's motion
 with the tag's (Eqs. 4-6), and coherence compares it with the raw phase reads; the log-odds map is carried along the
-flow and updated (Eq. 7 with a background class and forgetting), pooled in the segments (III.G), and cut. What goes
-beyond the paper: an object is one compact thing in 3D, and it is next to where it was a frame ago.
+flow and updated (Eq. 7 with a background class and forgetting), pooled in the segments (III.G), and cut.
+
+What goes beyond the paper: the range anchor, by which all of the past says how far away the tag is now; a memory of
+the still background; and an object is one compact thing in 3D, next to where it was a frame ago. `paper_limit` gives
+the settings at which all of it is gone and the likelihood and the cut are the paper's.
 """
 
 from __future__ import annotations
+
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -14,22 +19,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ._numerics import logit, safe_norm
-from .attention import att_corr, att_rbf, attention, centre_first
+from .anchor import Anchor, log_density, lost_drift_m, move_anchor, update_belief, votes
+from .attention import att_corr, att_rbf, attention, centre_first, coherent_score, read_support
+from .background import Background, empty_background, in_front, is_background, remember
 from .motion import MotionMap, carry, empty_motion, push_gather
 from .propagation import log_likelihood_ratio, propagate, radio_speed, soft_clip, velocity_gate
-from .rf.coherence import coherence, phase_residual
 from .rf.reads import PhaseReads, RadioWindow
-from .segmentation import (
-    Segments,
-    bounding_box,
-    diffuse,
-    mean_shift,
-    pool,
-    segment,
-    segment_affinity,
-    unpool,
-)
-from .tracer import AbstractTracer, Camera, Frame, Trace
+from .segmentation import Segments, cdf_cut, compact_cut, diffuse, pool, segment, segment_affinity, unpool
+from .tracer import AbstractTracer, Camera, Frame, Trace, describe
+
+SIGNIFICANCE = 1e-3
+"""Share of the pixels by which the histogram rises at a corner of its CDF."""
+
+
+class Place(eqx.Module):
+    """Where each tag's object was at the last frame."""
+
+    centre_m: Float[Array, "*tag 3"]
+    velocity_m_s: Float[Array, "*tag 3"]
+    confidence: Float[Array, "*tag"]
 
 
 class TagAttentionState(eqx.Module):
@@ -38,9 +46,26 @@ class TagAttentionState(eqx.Module):
     motion: MotionMap
     time_s: Float[Array, " window"]
     log_odds: Float[Array, "tag height width"]
-    centre_m: Float[Array, "tag 3"]
-    velocity_m_s: Float[Array, "tag 3"]
-    confidence: Float[Array, " tag"]
+    place: Place
+    anchor: Anchor
+    background: Background
+
+
+class _View(eqx.Module):
+    """One frame as all tags share it."""
+
+    points_m: Float[Array, "height width 3"]
+    distance_m: Float[Array, "height width"]
+    valid: Bool[Array, "height width"]
+    front: Float[Array, "height width"]
+    time_s: Float[Array, " window"]
+    segments: Segments
+    segment_range_m: Float[Array, "rows columns"]
+    segment_mass: Float[Array, "rows columns"]
+    affinity: Float[Array, "9 rows columns"]
+    rho: Float[Array, "height width window"]
+    known: Bool[Array, "height width"]
+    rho_segment: Float[Array, "rows columns window"]
 
 
 def _log(value: float) -> Float[Array, ""]:
@@ -53,16 +78,46 @@ def _logit(value: float) -> Float[Array, ""]:
     return jnp.asarray(logit(min(max(value, 1e-6), 1.0 - 1e-6)), jnp.float32)
 
 
+def paper_limit() -> dict[str, Any]:
+    """Settings at which `TagAttention` is the paper's Eqs. 4-7 and its CDF-corner cut (without the refinement).
+
+    Pixels are carried by gathering instead of splatting, and those without a full window stay as they are.
+    """
+    nothing = 1e-12
+    return {
+        "alpha_m2": 5e-4,
+        "beta": 0.8,
+        "floor": 1e-6,
+        "background": 1.0,
+        "profile": 0.0,
+        "coherent_weight": nothing,
+        "v0_m_s": 0.1,
+        "gate_width_m_s": 1e-6,
+        "forgetting": 1.0,
+        "evidence_limit": 1e6,
+        "pool_motion": 0.0,
+        "pool_log_odds": 0.0,
+        "diffusion": 0.0,
+        "prior_weight": nothing,
+        "anchor_limit": nothing,
+        "anchor_rate": nothing,
+        "foreground_weight": nothing,
+        "cut_rule": "cdf_corner",
+        "cut_width": 1e-7,
+    }
+
+
 class TagAttention(AbstractTracer):
     """Learnable TagAttention.
 
-    Leaves whose names start with `log_` or `logit_` are stored unconstrained; properties give the physical values.
+    Leaves whose names start with `log_` or `logit_` are stored unconstrained; `physical` gives the values.
     """
 
     log_alpha: Float[Array, ""]
     logit_beta: Float[Array, ""]
     log_floor: Float[Array, ""]
     logit_background: Float[Array, ""]
+    logit_profile: Float[Array, ""]
     log_coherent_weight: Float[Array, ""]
     coherent_level: Float[Array, ""]
     log_v0: Float[Array, ""]
@@ -82,24 +137,35 @@ class TagAttention(AbstractTracer):
     log_prior_weight: Float[Array, ""]
     log_prior_radius: Float[Array, ""]
     logit_inertia: Float[Array, ""]
+    log_anchor_weight: Float[Array, ""]
+    log_anchor_width: Float[Array, ""]
+    log_anchor_depth: Float[Array, ""]
+    log_anchor_limit: Float[Array, ""]
+    log_anchor_drift: Float[Array, ""]
+    log_anchor_rate: Float[Array, ""]
+    anchor_unseen: Float[Array, ""]
+    log_foreground_weight: Float[Array, ""]
 
     cell: int = eqx.field(static=True)
     max_speed_m_s: float = eqx.field(static=True)
     box_tail: float = eqx.field(static=True)
     doubled_angle: bool = eqx.field(static=True)
+    anchor_bins: int = eqx.field(static=True)
+    cut_rule: Literal["margin", "cdf_corner"] = eqx.field(static=True)
 
     def __init__(
         self,
         *,
-        alpha_m2: float = 0.01,
+        alpha_m2: float = 0.005,
         beta: float = 0.8,
         floor: float = 0.02,
-        background: float = 0.2,
-        coherent_weight: float = 1.0,
+        background: float = 0.3,
+        profile: float = 1.0,
+        coherent_weight: float = 2.0,
         coherent_level: float = 0.6,
         v0_m_s: float = 0.2,
         gate_width_m_s: float = 0.05,
-        forgetting: float = 0.93,
+        forgetting: float = 0.97,
         evidence_limit: float = 12.0,
         pool_motion: float = 0.9,
         pool_log_odds: float = 0.8,
@@ -114,10 +180,20 @@ class TagAttention(AbstractTracer):
         prior_weight: float = 8.0,
         prior_radius_m: float = 0.5,
         inertia: float = 0.9,
+        anchor_weight: float = 0.2,
+        anchor_width_m: float = 0.2,
+        anchor_depth_m: float = 0.2,
+        anchor_limit: float = 4.0,
+        anchor_drift_m: float = 0.01,
+        anchor_rate: float = 0.3,
+        anchor_unseen: float = -1.0,
+        foreground_weight: float = 3.0,
         cell: int = 8,
         max_speed_m_s: float = 3.0,
         box_tail: float = 0.02,
         doubled_angle: bool = True,
+        anchor_bins: int = 120,
+        cut_rule: Literal["margin", "cdf_corner"] = "margin",
     ):
         """Initial values in physical units.
 
@@ -125,6 +201,7 @@ class TagAttention(AbstractTracer):
             alpha_m2: RBF kernel parameter (Eq. 4), m^2.
             beta: share of the RBF attention (Eq. 6).
             floor, background: floor and background attention of the log-likelihood ratio.
+            profile: share of the mean misfit over a window that is taken for noise of its first sample; 0 in the paper.
             coherent_weight, coherent_level: weight of the coherent phase term, and the score that speaks for neither.
             v0_m_s, gate_width_m_s: velocity threshold (Eq. 7) and width of its soft step.
             forgetting: factor on the past per frame of full evidence; 1 in the paper.
@@ -135,13 +212,24 @@ class TagAttention(AbstractTracer):
             cut, cut_width, cut_margin: log odds of the mask's edge; its softness; at most `cut_margin` below the best.
             extent_m: how far an object reaches from its centre.
             prior_weight, prior_radius_m, inertia: pull towards the place predicted from the last frame.
+            anchor_weight, anchor_width_m, anchor_unseen: how much a frame's evidence tells about the tag's range; how
+                near a segment must be to vote; log likelihood of a range at which nothing agrees (it may be hidden).
+            anchor_depth_m, anchor_limit, anchor_rate: depth of an object; bound of the log density of its range; the
+                share of it that counts as evidence of the pixel's identity.
+            anchor_drift_m: error of the radio's distance that adds up, per frame.
+            foreground_weight: pull of what stands before the background.
             cell: cell of the segmentation grid, pixels of the working resolution.
             max_speed_m_s: a faster change of a pixel's distance is another surface.
             box_tail: share of the mask that the box may leave out on each side.
             doubled_angle: take phases modulo pi in the coherent term (readers with pi flips).
+            anchor_bins: number of ranges of 0.1 m that the anchor tells apart.
+            cut_rule: "margin", or "cdf_corner" as in the paper.
         """
+        if cut_rule not in ("margin", "cdf_corner"):
+            raise ValueError(f"cut_rule is {cut_rule!r}; expected 'margin' or 'cdf_corner'.")
         self.log_alpha, self.logit_beta = _log(alpha_m2), _logit(beta)
         self.log_floor, self.logit_background = _log(floor), _logit(background)
+        self.logit_profile = _logit(profile)
         self.log_coherent_weight = _log(coherent_weight)
         self.coherent_level = jnp.asarray(coherent_level, jnp.float32)
         self.log_v0, self.log_gate_width = _log(v0_m_s), _log(gate_width_m_s)
@@ -155,8 +243,14 @@ class TagAttention(AbstractTracer):
         self.log_extent = _log(extent_m)
         self.log_prior_weight, self.log_prior_radius = _log(prior_weight), _log(prior_radius_m)
         self.logit_inertia = _logit(inertia)
+        self.log_anchor_weight, self.log_anchor_width = _log(anchor_weight), _log(anchor_width_m)
+        self.log_anchor_depth, self.log_anchor_limit = _log(anchor_depth_m), _log(anchor_limit)
+        self.log_anchor_drift, self.log_anchor_rate = _log(anchor_drift_m), _log(anchor_rate)
+        self.anchor_unseen = jnp.asarray(anchor_unseen, jnp.float32)
+        self.log_foreground_weight = _log(foreground_weight)
         self.cell, self.max_speed_m_s = cell, max_speed_m_s
         self.box_tail, self.doubled_angle = box_tail, doubled_angle
+        self.anchor_bins, self.cut_rule = anchor_bins, cut_rule
 
     def physical(self) -> dict[str, float]:
         """The learnable parameters in physical units, by name."""
@@ -178,9 +272,9 @@ class TagAttention(AbstractTracer):
             motion=empty_motion(height, width, num_window),
             time_s=jnp.broadcast_to(frame.time_s, (num_window,)),
             log_odds=jnp.zeros((num_tags, height, width)),
-            centre_m=jnp.zeros((num_tags, 3)),
-            velocity_m_s=jnp.zeros((num_tags, 3)),
-            confidence=jnp.zeros(num_tags),
+            place=Place(jnp.zeros((num_tags, 3)), jnp.zeros((num_tags, 3)), jnp.zeros(num_tags)),
+            anchor=Anchor.unknown(num_tags, num_window, self.anchor_bins),
+            background=empty_background(num_tags, height, width),
         )
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
@@ -190,59 +284,103 @@ class TagAttention(AbstractTracer):
         time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
         elapsed_s = jnp.maximum(time_s[-1] - time_s[-2], 1e-3)
         motion = push_gather(state.motion, frame.backward_px, distance, self.max_speed_m_s * elapsed_s + 0.05)
-
         recent = motion.valid[..., -1] & motion.valid[..., -2]
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
-        segments = segment(
-            jnp.concatenate([points, step_m[..., None]], axis=-1),
-            valid,
-            jnp.exp(self.log_segment_temperature),
-            cell=self.cell,
-        )
-        rho, known, rho_segment = self._pooled_motion(segments, motion)
-        means, _ = pool(segments, jnp.concatenate([points, step_m[..., None]], axis=-1), valid.astype(points.dtype))
-        affinity = segment_affinity(
-            segments, means[..., :3], means[..., 3], jnp.exp(self.log_affinity_length), jnp.exp(self.log_affinity_step)
-        )
-        carried = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), frame.backward_px, jnp.zeros(())), -1, 0)
-        # A surface that was hidden a frame ago brings no history of its own.
-        carried = jnp.where((motion.valid[..., -2] | ~valid)[None], carried, 0.0)
+        view = self._view(points, distance, valid, motion, step_m, time_s, state.background)
 
-        def one_tag(carried, radio, reads, centre, velocity, confidence):
-            evidence = self._evidence(segments, rho, known, rho_segment, radio, reads, time_s)
-            speed = radio_speed(radio.relative_m, time_s)
-            alpha = jnp.exp(self.log_alpha)
-            uncertainty = jnp.mean(jnp.square(jnp.where(jnp.isfinite(radio.std_m), radio.std_m, 1e3)))
-            gate = velocity_gate(speed, jnp.exp(self.log_v0), jnp.exp(self.log_gate_width))
-            gate = gate * alpha / (alpha + uncertainty)
-            log_odds = propagate(carried, evidence, gate, jax.nn.sigmoid(self.logit_forgetting))
-            log_odds = soft_clip(log_odds, jnp.exp(self.log_evidence_limit))
-            share = jax.nn.sigmoid(self.logit_pool_log_odds)
-            pooled, _ = pool(segments, log_odds[..., None], valid.astype(log_odds.dtype))
-            refined = jnp.where(valid, (1 - share) * log_odds + share * unpool(segments, pooled)[..., 0], log_odds)
-            spread = diffuse(pooled[..., 0], affinity, jax.nn.sigmoid(self.logit_diffusion))
-            smooth = jnp.where(
-                valid, (1 - share) * log_odds + share * unpool(segments, spread[..., None])[..., 0], log_odds
-            )
-            predicted = centre + velocity * elapsed_s * jax.nn.sigmoid(self.logit_inertia)
-            mask, new_centre = self._cut(points, valid, smooth, predicted, confidence)
-            inside = jnp.max(jnp.where((mask > 0.5) & valid, refined, -9.0))
-            new_confidence = jax.nn.sigmoid(inside)
-            both = (confidence > 0.5) & (new_confidence > 0.5)
-            move = jnp.clip((new_centre - centre) / elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
-            new_velocity = jnp.where(both, 0.5 * velocity + 0.5 * move, 0.0)
-            return refined, mask, new_centre, new_velocity, new_confidence
+        moved = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), frame.backward_px, jnp.zeros(())), -1, 0)
+        # A surface that was hidden a frame ago brings no history of its own, but for what its pixel remembers.
+        shows = is_background(state.background, distance, valid)
+        recalled = jnp.where(shows[None], state.background.log_odds, 0.0)
+        carried = jnp.where((motion.valid[..., -2] | ~valid)[None], moved, recalled)
 
-        log_odds, mask, centre, velocity, confidence = jax.vmap(one_tag)(
-            carried, frame.radio, frame.reads, state.centre_m, state.velocity_m_s, state.confidence
+        log_odds, mask, place, anchor = jax.vmap(self._trace_tag, in_axes=(None, None, 0, 0, 0, 0, 0))(
+            view, elapsed_s, carried, frame.radio, frame.reads, state.place, state.anchor
         )
+        background = remember(state.background, distance, valid, log_odds)
+        out = describe(mask, place.centre_m, step_m, recent, place.confidence, self.box_tail)
         # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
-        place = jax.lax.stop_gradient((centre, velocity, confidence))
-        new_state = TagAttentionState(motion, time_s, log_odds, *place)
-        return new_state, describe(mask, centre, step_m, recent, confidence, self.box_tail)
+        return TagAttentionState(motion, time_s, log_odds, jax.lax.stop_gradient(place), anchor, background), out
 
     def finish(self, state: TagAttentionState) -> TagAttentionState:
         return state
+
+    def _view(
+        self,
+        points_m: Float[Array, "height width 3"],
+        distance_m: Float[Array, "height width"],
+        valid: Bool[Array, "height width"],
+        motion: MotionMap,
+        step_m: Float[Array, "height width"],
+        time_s: Float[Array, " window"],
+        background: Background,
+    ) -> _View:
+        """Segments, their motion, and what stands in front: once a frame, for all tags."""
+        features = jnp.concatenate([points_m, step_m[..., None]], axis=-1)
+        segments = segment(features, valid, jnp.exp(self.log_segment_temperature), cell=self.cell)
+        rho, known, rho_segment = self._pooled_motion(segments, motion)
+        means, mass = pool(
+            segments, jnp.concatenate([features, distance_m[..., None]], axis=-1), valid.astype(points_m.dtype)
+        )
+        affinity = segment_affinity(
+            segments, means[..., :3], means[..., 3], jnp.exp(self.log_affinity_length), jnp.exp(self.log_affinity_step)
+        )
+        return _View(
+            points_m=points_m,
+            distance_m=distance_m,
+            valid=valid,
+            front=in_front(background, distance_m, valid),
+            time_s=time_s,
+            segments=segments,
+            segment_range_m=means[..., 4],
+            segment_mass=mass,
+            affinity=affinity,
+            rho=rho,
+            known=known,
+            rho_segment=rho_segment,
+        )
+
+    def _trace_tag(
+        self,
+        view: _View,
+        elapsed_s: Float[Array, ""],
+        carried: Float[Array, "height width"],
+        radio: RadioWindow,
+        reads: PhaseReads,
+        place: Place,
+        anchor: Anchor,
+    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"], Place, Anchor]:
+        """One tag's update: log odds, soft mask, place, anchor."""
+        valid = view.valid
+        evidence = self._evidence(view, radio, reads)
+        gate = self._gate(radio, view.time_s)
+        anchor = self._update_anchor(anchor, view, evidence, radio, gate)
+        near = log_density(
+            anchor, view.distance_m, jnp.exp(self.log_anchor_depth), jnp.exp(self.log_anchor_limit)
+        ) * valid.astype(evidence.dtype)
+        evidence = evidence + jnp.exp(self.log_anchor_rate) * near
+        log_odds = propagate(carried, evidence, gate, jax.nn.sigmoid(self.logit_forgetting))
+        log_odds = soft_clip(log_odds, jnp.exp(self.log_evidence_limit))
+
+        share = jax.nn.sigmoid(self.logit_pool_log_odds)
+        pooled, _ = pool(view.segments, log_odds[..., None], valid.astype(log_odds.dtype))
+
+        def refine(grid: Float[Array, "rows columns"]) -> Float[Array, "height width"]:
+            mixed = (1.0 - share) * log_odds + share * unpool(view.segments, grid[..., None])[..., 0]
+            return jnp.where(valid, mixed, log_odds)
+
+        refined = refine(pooled[..., 0])
+        spread = diffuse(pooled[..., 0], view.affinity, jax.nn.sigmoid(self.logit_diffusion))
+        # What carries the tag moves, so it stands before what has always been there.
+        shown = refine(spread) + near + jnp.exp(self.log_foreground_weight) * view.front
+        predicted = place.centre_m + place.velocity_m_s * elapsed_s * jax.nn.sigmoid(self.logit_inertia)
+        mask, centre = self._cut(view, shown, predicted, place.confidence)
+        sure = jnp.max(jnp.where((mask > 0.5) & valid, refined + near, -9.0))
+        confidence = jax.nn.sigmoid(sure)
+        both = (place.confidence > 0.5) & (confidence > 0.5)
+        move = jnp.clip((centre - place.centre_m) / elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
+        velocity = jnp.where(both, 0.5 * place.velocity_m_s + 0.5 * move, 0.0)
+        return refined, mask, Place(centre, velocity, confidence), anchor
 
     def _pooled_motion(
         self, segments: Segments, motion: MotionMap
@@ -261,116 +399,73 @@ class TagAttention(AbstractTracer):
         blended = jnp.where(has[..., None], (1 - mix) * own + mix * pooled, own)
         return jnp.where(full[..., None], blended, pooled), full | has, mean * solid
 
-    def _evidence(
-        self,
-        segments: Segments,
-        rho: Float[Array, "height width window"],
-        known: Bool[Array, "height width"],
-        rho_segment: Float[Array, "rows columns window"],
-        radio: RadioWindow,
-        reads: PhaseReads,
-        time_s: Float[Array, " window"],
-    ) -> Float[Array, "height width"]:
+    def _gate(self, radio: RadioWindow, time_s: Float[Array, " window"]) -> Float[Array, ""]:
+        """The soft step of Eq. 7, closed as well where the radio knows less than the kernel asks."""
+        speed = radio_speed(radio.relative_m, time_s)
+        alpha = jnp.exp(self.log_alpha)
+        uncertainty = jnp.mean(jnp.square(jnp.where(jnp.isfinite(radio.std_m), radio.std_m, 1e3)))
+        gate = velocity_gate(speed, jnp.exp(self.log_v0), jnp.exp(self.log_gate_width))
+        return gate * alpha / (alpha + uncertainty)
+
+    def _evidence(self, view: _View, radio: RadioWindow, reads: PhaseReads) -> Float[Array, "height width"]:
         """Log-likelihood ratio of object against background at each pixel: Eqs. 4-6 and the coherent phase term."""
-        everywhere = jnp.ones(rho.shape, dtype=bool)
-        # The mean misfit over the window is profiled out: a single noisy first sample would offset all others.
-        offset = jnp.mean(rho - radio.relative_m[None, None], axis=-1, keepdims=True)
+        everywhere = jnp.ones(view.rho.shape, dtype=bool)
         relative = radio.relative_m[None, None]
-        rbf = att_rbf(rho - offset, relative, everywhere, jnp.exp(self.log_alpha)[None, None])
-        corr = att_corr(rho, relative, everywhere)
+        # The mean misfit over the window is profiled out: a single noisy first sample would offset all others.
+        offset = jax.nn.sigmoid(self.logit_profile) * jnp.mean(view.rho - relative, axis=-1, keepdims=True)
+        rbf = att_rbf(view.rho - offset, relative, everywhere, jnp.exp(self.log_alpha)[None, None])
+        corr = att_corr(view.rho, relative, everywhere)
         att = attention(rbf, corr, jax.nn.sigmoid(self.logit_beta))
         ratio = log_likelihood_ratio(att, jax.nn.sigmoid(self.logit_background), jnp.exp(self.log_floor))
-        score = coherent_score(rho_segment, reads, time_s, doubled_angle=self.doubled_angle)
-        coherent = unpool(segments, (score - self.coherent_level)[..., None] * _read_support(reads))[..., 0]
-        return jnp.where(known, ratio + jnp.exp(self.log_coherent_weight) * coherent, 0.0)
+        score = coherent_score(view.rho_segment, reads, view.time_s, doubled_angle=self.doubled_angle)
+        coherent = unpool(view.segments, (score - self.coherent_level)[..., None] * read_support(reads))[..., 0]
+        return jnp.where(view.known, ratio + jnp.exp(self.log_coherent_weight) * coherent, 0.0)
+
+    def _update_anchor(
+        self,
+        anchor: Anchor,
+        view: _View,
+        evidence: Float[Array, "height width"],
+        radio: RadioWindow,
+        gate: Float[Array, ""],
+    ) -> Anchor:
+        """Move the anchor with the radio, and let the segments that agree with the tag vote for its range."""
+        heard = jnp.all(jnp.isfinite(radio.std_m))
+        drift = jnp.where(heard, jnp.exp(self.log_anchor_drift), lost_drift_m(view.time_s))
+        anchor = move_anchor(anchor, radio.relative_m, heard, drift)
+        told, _ = pool(view.segments, evidence[..., None], view.valid.astype(evidence.dtype))
+        vote = votes(
+            anchor,
+            view.segment_range_m.reshape(-1),
+            told.reshape(-1),
+            view.segment_mass.reshape(-1) > 1.0,
+            jnp.exp(self.log_anchor_width),
+            self.anchor_unseen,
+        )
+        return update_belief(anchor, vote, jnp.exp(self.log_anchor_weight) * gate)
 
     def _cut(
         self,
-        points: Float[Array, "height width 3"],
-        valid: Bool[Array, "height width"],
+        view: _View,
         log_odds: Float[Array, "height width"],
         predicted_m: Float[Array, " 3"],
         confidence: Float[Array, ""],
     ) -> tuple[Float[Array, "height width"], Float[Array, " 3"]]:
         """The soft mask, and the object's centre: log odds with the place prior, cut, kept to one compact thing."""
-        away = jnp.sum(jnp.square(points - predicted_m[None, None]), axis=-1) / (
-            2.0 * jnp.exp(2.0 * self.log_prior_radius)
-        )
-        prior = jnp.exp(self.log_prior_weight) * confidence * (2.0 * jnp.exp(-away) - 1.0)
-        total = log_odds + prior
-        best = jnp.max(jnp.where(valid, total, -1e3))
-        threshold = jnp.minimum(self.cut, best - jnp.exp(self.log_cut_margin))
         width = jnp.exp(self.log_cut_width)
-        known = valid.astype(total.dtype)
-        weight = jax.nn.sigmoid((total - threshold) / width) * known
-        peak = jnp.where(valid, jnp.exp(jnp.minimum(total - best, 0.0) / width), 0.0)
-        start = jnp.sum(points * peak[..., None], axis=(0, 1)) / jnp.maximum(jnp.sum(peak), 1e-6)
-        extent = jnp.exp(self.log_extent)
-        centre = mean_shift(points, weight, start, extent)
-        spread = jnp.sum(jnp.square(points - centre[None, None]), axis=-1) / (2.0 * extent**2)
-        return jax.nn.sigmoid((total - threshold - spread) / width) * known, centre
-
-
-def _first_of_channel(reads: PhaseReads) -> Array:
-    """Reads grouped by channel within the buffer: each read's group is the index of the channel's first read."""
-    same = reads.channel[:, None] == reads.channel[None, :]
-    return jnp.argmax(same & reads.valid[None, :], axis=1)
-
-
-def _read_support(reads: PhaseReads) -> Float[Array, ""]:
-    """Share of the reads left once every channel has spent one on its unknown offset; 0 without reads."""
-    first = reads.valid & (_first_of_channel(reads) == jnp.arange(reads.channel.shape[0]))
-    count, groups = (jnp.sum(flags.astype(reads.time_s.dtype)) for flags in (reads.valid, first))
-    return jnp.where(count > 0, (count - groups) / jnp.maximum(count, 1.0), 0.0)
-
-
-def coherent_score(
-    rho_m: Float[Array, "rows columns window"],
-    reads: PhaseReads,
-    time_s: Float[Array, " window"],
-    *,
-    doubled_angle: bool,
-) -> Float[Array, "rows columns"]:
-    """Coherence of raw reads with motion known at frame times, linear in between; in [0, 1]."""
-    upper = jnp.clip(jnp.searchsorted(time_s, reads.time_s), 1, time_s.shape[0] - 1)
-    span = time_s[upper] - time_s[upper - 1]
-    fraction = jnp.clip((reads.time_s - time_s[upper - 1]) / jnp.where(span > 0, span, 1.0), 0.0, 1.0)
-    share = fraction[None, None]
-    distance = rho_m[..., upper - 1] * (1.0 - share) + rho_m[..., upper] * share
-    residual = phase_residual(reads.phase_rad[None, None], reads.carrier_hz[None, None], distance)
-    weight = reads.valid.astype(rho_m.dtype) / (jnp.square(reads.sigma_rad) + 0.1)
-    return coherence(
-        residual,
-        weight[None, None],
-        _first_of_channel(reads)[None, None],
-        num_channels=reads.channel.shape[0],
-        multiple=2 if doubled_angle else 1,
-    )
-
-
-def describe(
-    mask: Float[Array, "tag height width"],
-    centre_m: Float[Array, "tag 3"],
-    step_m: Float[Array, "height width"],
-    recent: Bool[Array, "height width"],
-    confidence: Float[Array, " tag"],
-    box_tail: float,
-) -> Trace:
-    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distance."""
-    hard = jnp.where(mask > 0.5, mask, 0.0)
-    total = jnp.sum(hard, axis=(1, 2))
-    height, width = mask.shape[1:]
-    divisor = jnp.maximum(total, 1e-6)
-    x = jnp.sum(hard * jnp.arange(width, dtype=mask.dtype)[None, None], axis=(1, 2)) / divisor
-    y = jnp.sum(hard * jnp.arange(height, dtype=mask.dtype)[None, :, None], axis=(1, 2)) / divisor
-    moving = mask * recent.astype(mask.dtype)[None]
-    change = jnp.sum(moving * step_m[None], axis=(1, 2)) / jnp.maximum(jnp.sum(moving, axis=(1, 2)), 1e-6)
-    return Trace(
-        mask=mask,
-        box_px=jax.vmap(lambda m: bounding_box(m, box_tail))(hard),
-        centre_px=jnp.stack([x, y], axis=-1),
-        centre_m=centre_m,
-        step_m=change,
-        confidence=confidence,
-        found=(confidence > 0.5) & (total > 0),
-    )
+        if self.cut_rule == "cdf_corner":
+            mask = cdf_cut(log_odds, view.valid, jnp.asarray(SIGNIFICANCE), 0.1 * width)
+            total = jnp.maximum(jnp.sum(mask), 1e-6)
+            return mask, jnp.sum(view.points_m * mask[..., None], axis=(0, 1)) / total
+        away = jnp.sum(jnp.square(view.points_m - predicted_m[None, None]), axis=-1)
+        near = jnp.exp(-away / (2.0 * jnp.exp(2.0 * self.log_prior_radius)))
+        prior = jnp.exp(self.log_prior_weight) * confidence * (2.0 * near - 1.0)
+        return compact_cut(
+            view.points_m,
+            view.valid,
+            log_odds + prior,
+            level=self.cut,
+            margin=jnp.exp(self.log_cut_margin),
+            width=width,
+            extent_m=jnp.exp(self.log_extent),
+        )

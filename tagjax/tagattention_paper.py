@@ -16,9 +16,8 @@ from .attention import att_corr, att_rbf, attention, centre_first
 from .image.warp import splat
 from .motion import MotionMap, empty_motion, push_splat
 from .propagation import log_likelihood_ratio, propagate, radio_speed, velocity_gate
-from .segmentation import cdf_corner, min_max, pool, segment, unpool
-from .tagattention import describe
-from .tracer import AbstractTracer, Camera, Frame, Trace
+from .segmentation import cdf_cut, pool, segment, unpool
+from .tracer import AbstractTracer, Camera, Frame, Trace, describe
 
 FLOOR = 1e-6
 SIGNIFICANCE = 1e-3
@@ -81,12 +80,7 @@ class TagAttentionPaper(AbstractTracer):
             if self.refine:
                 pooled, _ = pool(segments, likelihood[..., None], valid.astype(likelihood.dtype))
                 likelihood = jnp.where(valid, unpool(segments, pooled)[..., 0], likelihood)
-            top = jnp.max(jnp.where(valid, likelihood, -jnp.inf))
-            top = jnp.where(jnp.isfinite(top), top, 0.0)
-            probability = min_max(jnp.exp(likelihood - top), valid)
-            corner = cdf_corner(probability, valid, jnp.asarray(SIGNIFICANCE), 0.01 * width)
-            mask = jax.nn.sigmoid((probability - corner) / (0.1 * width))
-            return likelihood, jnp.where(valid & (jnp.max(probability) > 0), mask, 0.0)
+            return likelihood, cdf_cut(likelihood, valid, jnp.asarray(SIGNIFICANCE), 0.01 * width)
 
         likelihood, mask = jax.vmap(one_tag)(warped, frame.radio)
         total = jnp.maximum(jnp.sum(mask, axis=(1, 2)), 1e-6)

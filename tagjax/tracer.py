@@ -7,9 +7,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .rf.reads import PhaseReads, RadioWindow
+from .segmentation import bounding_box
 
 
 class Camera(eqx.Module):
@@ -68,3 +70,31 @@ def trace(tracer: AbstractTracer, camera: Camera, clip: Frame) -> Trace:
     first = jax.tree.map(lambda leaf: leaf[0], clip)
     _, out = jax.lax.scan(lambda state, frame: tracer.step(camera, state, frame), tracer.init(camera, first), clip)
     return out
+
+
+def describe(
+    mask: Float[Array, "tag height width"],
+    centre_m: Float[Array, "tag 3"],
+    step_m: Float[Array, "height width"],
+    recent: Bool[Array, "height width"],
+    confidence: Float[Array, " tag"],
+    box_tail: float,
+) -> Trace:
+    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distance."""
+    hard = jnp.where(mask > 0.5, mask, 0.0)
+    total = jnp.sum(hard, axis=(1, 2))
+    height, width = mask.shape[1:]
+    divisor = jnp.maximum(total, 1e-6)
+    x = jnp.sum(hard * jnp.arange(width, dtype=mask.dtype)[None, None], axis=(1, 2)) / divisor
+    y = jnp.sum(hard * jnp.arange(height, dtype=mask.dtype)[None, :, None], axis=(1, 2)) / divisor
+    moving = mask * recent.astype(mask.dtype)[None]
+    change = jnp.sum(moving * step_m[None], axis=(1, 2)) / jnp.maximum(jnp.sum(moving, axis=(1, 2)), 1e-6)
+    return Trace(
+        mask=mask,
+        box_px=jax.vmap(lambda m: bounding_box(m, box_tail))(hard),
+        centre_px=jnp.stack([x, y], axis=-1),
+        centre_m=centre_m,
+        step_m=change,
+        confidence=confidence,
+        found=(confidence > 0.5) & (total > 0),
+    )

@@ -28,6 +28,8 @@ LAYERS = {
     "attention": 2,
     "propagation": 2,
     "segmentation": 2,
+    "anchor": 2,
+    "background": 2,
     "tracer": 3,
     "tagattention": 3,
     "tagattention_paper": 3,

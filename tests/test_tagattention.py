@@ -1,5 +1,7 @@
 """The tracers: the paper's update step by step, the learnable one's gradients, determinism and degenerate input."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ import synthetic_clips as synthetic
 from tagjax.data.clips import load_clip
 from tagjax.motion import empty_motion, push_gather, push_splat
 from tagjax.rf.reads import RadioWindow
-from tagjax.tagattention import TagAttention
+from tagjax.tagattention import TagAttention, paper_limit
 from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
 from tagjax.tracer import Frame, trace
 
@@ -25,6 +27,11 @@ def clip():
     return load_clip(synthetic.recording(24), 0, 24, stride=1)
 
 
+@pytest.fixture(scope="module")
+def said(clip):
+    return eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
+
+
 def _shapes(out, clip):
     num_tags = len(clip.epcs)
     time, height, width = clip.frames.depth_m.shape
@@ -34,8 +41,8 @@ def _shapes(out, clip):
         assert bool(jnp.isfinite(leaf).all())
 
 
-def test_the_learnable_tracer_finds_both_objects(clip):
-    out = eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
+def test_the_learnable_tracer_finds_both_objects(clip, said):
+    out = said
     _shapes(out, clip)
     for tag, (x0, y0, x1, y1) in enumerate(synthetic.BOXES.values()):
         mask = np.asarray(out.mask[-1, tag]) > 0.5
@@ -45,20 +52,19 @@ def test_the_learnable_tracer_finds_both_objects(clip):
         assert bool(out.found[-1, tag])
 
 
-def test_step_follows_the_objects_distance(clip):
-    out = eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
+def test_step_follows_the_objects_distance(clip, said):
+    out = said
     time_s = np.asarray(clip.frames.time_s)
     for tag, label in enumerate(synthetic.BOXES):
         expected = np.diff(synthetic.offset_m(label, time_s))[-8:]
         np.testing.assert_allclose(np.asarray(out.step_m[-8:, tag]), expected, atol=0.02)
 
 
-def test_tags_do_not_disturb_each_other(clip):
+def test_tags_do_not_disturb_each_other(clip, said):
     """Any number of tags by vmap: each is traced as if it were alone."""
-    both = eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
     alone = load_clip(synthetic.recording(24), 0, 24, stride=1, epcs=[clip.epcs[1]])
     single = eqx.filter_jit(trace)(_learnable(), alone.camera, alone.frames)
-    np.testing.assert_allclose(both.mask[:, 1], single.mask[:, 0], atol=1e-4)
+    np.testing.assert_allclose(said.mask[:, 1], single.mask[:, 0], atol=1e-4)
 
 
 def test_scan_is_the_loop_of_steps(clip):
@@ -67,8 +73,9 @@ def test_scan_is_the_loop_of_steps(clip):
     scanned = eqx.filter_jit(trace)(tracer, clip.camera, few)
     state = tracer.init(clip.camera, jax.tree.map(lambda leaf: leaf[0], few))
     shapes = jax.tree.map(jnp.shape, state)
+    step = eqx.filter_jit(tracer.step)
     for t in range(5):
-        state, said = tracer.step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], few))
+        state, said = step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], few))
         np.testing.assert_allclose(said.mask, scanned.mask[t], atol=1e-4)
     assert jax.tree.map(jnp.shape, tracer.finish(state)) == shapes
 
@@ -90,6 +97,13 @@ def test_every_parameter_gets_a_finite_gradient(clip):
     assert set(silent) <= {"logit_inertia"}
 
 
+@eqx.filter_jit
+@functools.partial(eqx.filter_value_and_grad, has_aux=True)
+def _total_and_gradient(tracer, camera, frames):
+    out = trace(tracer, camera, frames)
+    return jnp.sum(out.mask) + jnp.sum(out.step_m), out
+
+
 @pytest.mark.parametrize("tracer", [_learnable(), TagAttentionPaper(cell=4)], ids=["learnable", "paper"])
 @pytest.mark.parametrize("what", ["no depth", "no radio", "standing still"])
 def test_degenerate_input_stays_finite_with_its_gradient(clip, tracer, what):
@@ -104,11 +118,7 @@ def test_degenerate_input_stays_finite_with_its_gradient(clip, tracer, what):
         frames = eqx.tree_at(lambda f: f.radio, frames, still)
     frames = jax.tree.map(lambda leaf: leaf[:7], frames)
 
-    def total(tracer):
-        out = trace(tracer, clip.camera, frames)
-        return jnp.sum(out.mask) + jnp.sum(out.step_m), out
-
-    (_, out), gradient = eqx.filter_jit(eqx.filter_value_and_grad(total, has_aux=True))(tracer)
+    (_, out), gradient = _total_and_gradient(tracer, clip.camera, frames)
     for leaf in (*jax.tree.leaves(out), *jax.tree.leaves(gradient)):
         assert bool(jnp.isfinite(leaf).all())
     if what == "no depth":
@@ -123,8 +133,9 @@ def test_paper_update_is_equation_7(clip):
     rays = np.asarray(clip.camera.rays)
     distance = np.linalg.norm(rays * np.asarray(frames.depth_m)[..., None], axis=-1)
     expected = np.zeros(state.log_likelihood.shape)
+    step = eqx.filter_jit(tracer.step)
     for t in range(10):
-        state, _ = tracer.step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], frames))
+        state, _ = step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], frames))
         for tag in range(2):
             rd = np.asarray(frames.radio.relative_m[t, tag])
             speed = abs(rd[-1] - rd[0]) / float(frames.time_s[t] - frames.time_s[max(t - 4, 0)] + 1e-12)
@@ -151,13 +162,53 @@ def test_paper_update_is_equation_7(clip):
 def test_the_soft_tracer_has_the_paper_as_its_limit(clip):
     frames = jax.tree.map(lambda leaf: leaf[:12], clip.frames)
     # Without K-means, whose hard assignments tie in a scene seen through so long a lens.
-    paper = trace(TagAttentionPaper(refine=False), clip.camera, frames)
+    run = eqx.filter_jit(trace)
+    paper = run(TagAttentionPaper(refine=False), clip.camera, frames)
     gaps = []
     for softness in (0.3, 1e-2, 1e-7):
-        soft = trace(TagAttentionPaper(refine=False, softness=softness), clip.camera, frames)
+        soft = run(TagAttentionPaper(refine=False, softness=softness), clip.camera, frames)
         gaps.append(float(jnp.mean(jnp.abs(soft.mask - paper.mask))))
     assert gaps[2] < 1e-3
     assert gaps[0] > gaps[2]
+
+
+def test_the_learnable_tracer_has_the_paper_as_its_limit():
+    """At `paper_limit` likelihood and mask are those of the paper's tracer, and they part when a step is relaxed."""
+    clip = load_clip(synthetic.recording(24), 0, 24, stride=1, estimator="paper")
+    first = jax.tree.map(lambda leaf: leaf[0], clip.frames)
+    paper = TagAttentionPaper(refine=False)
+
+    def run(tracer, like):
+        def one(state, frame):
+            state, out = tracer.step(clip.camera, state, frame)
+            return state, (like(state), out.mask)
+
+        return jax.lax.scan(one, tracer.init(clip.camera, first), clip.frames)[1]
+
+    expected, mask = eqx.filter_jit(run)(paper, lambda state: state.log_likelihood)
+    # Before a window is full the paper gives every pixel the floor, the learnable tracer nothing: alike for all pixels.
+    inner = np.s_[6:, :, 2:-2, 2:-2]
+    level = lambda values: values - np.max(values, axis=(2, 3), keepdims=True)  # noqa: E731
+
+    learnable = eqx.filter_jit(functools.partial(run, like=lambda state: state.log_odds))
+
+    def gap(**changed):
+        found, soft = learnable(TagAttention(**{**paper_limit(), **changed}))
+        worst = np.abs(level(np.asarray(found)[inner]) - level(np.asarray(expected)[inner])).max()
+        return worst, np.abs(np.asarray(soft)[inner] - np.asarray(mask)[inner]).mean()
+
+    assert np.ptp(np.asarray(expected)[inner]) > 10
+    likelihood, masks = gap()
+    assert likelihood < 0.01
+    assert masks < 1e-3
+    for relaxed in (
+        {"profile": 1.0},
+        {"forgetting": 0.9},
+        {"background": 0.3, "floor": 0.02},
+        {"anchor_limit": 4.0, "anchor_rate": 0.3},
+    ):
+        assert gap(**relaxed)[0] > 0.1, relaxed
+    assert gap(cut_width=0.01)[1] > masks
 
 
 def test_motion_maps_follow_a_shift_either_way():
