@@ -1,0 +1,46 @@
+"""Measure the stages against named peers in the same run; the last line printed is the result as JSON.
+
+python -m experiments.benchmark
+python -m experiments.benchmark 'cases=[gather,splat]' repeats=21
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="benchmark")
+def main(config: DictConfig) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tagjax.config import from_mapping
+    from tagjax.evaluation.benchmark import BenchmarkSettings, machine, run_benchmark
+
+    console = Console()
+    settings = from_mapping(BenchmarkSettings, resolved(config))
+    with console.status("measuring") as status:
+        timings = run_benchmark(settings, on_case=lambda name: status.update(f"measuring {name}"))
+    table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s")
+    for timing in timings:
+        first = f"{timing.compile_s:.1f}" if timing.compile_s else ""
+        row = (timing.what, f"{timing.ours_ms:.2f}", timing.peer, f"{timing.peer_ms:.2f}", f"{timing.ratio:.2f}", first)
+        table.add_row(*row)
+    console.print(table)
+    rows = [{**dataclasses.asdict(timing), "ratio": timing.ratio} for timing in timings]
+    text = json.dumps({"machine": machine(), "timings": rows})
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    (folder / "benchmark.json").write_text(text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

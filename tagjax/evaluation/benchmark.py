@@ -1,0 +1,247 @@
+"""How fast the stages are, each against a named peer that does the same, or what it replaces, in the same run.
+
+Times are medians over repetitions after a warm-up, device work waited for; the ratio is ours over the peer's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..data.clips import load_clip
+from ..flow.opencv import make_flow
+from ..image.warp import gather, splat
+from ..rf.coherence import coherence
+from ..rf.windows import phase_reads, radio_windows
+from ..segmentation import segment
+from ..sim.session import SceneSettings, simulate_recording
+from ..tagattention import TagAttention
+from ..tracer import trace
+
+
+@dataclasses.dataclass(frozen=True)
+class BenchmarkSettings:
+    """What is measured, and how long."""
+
+    cases: tuple[str, ...] = ("gather", "splat", "segment", "coherence", "radio", "step", "simulate")
+    height: int = 424
+    width: int = 512
+    repeats: int = 7
+    seed: int = 0
+
+    def __post_init__(self):
+        unknown = sorted(set(self.cases) - set(CASES))
+        if unknown or not self.cases:
+            raise ValueError(f"Unknown benchmark {', '.join(unknown) or '(none)'}; there are {', '.join(CASES)}.")
+        if self.height < 32 or self.width < 32 or self.repeats < 1:
+            raise ValueError("A benchmark needs pictures of at least 32x32 pixels and 1 repetition.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """One measurement: ours and the peer's, milliseconds."""
+
+    what: str
+    ours_ms: float
+    peer: str
+    peer_ms: float
+    compile_s: float = 0.0
+
+    @property
+    def ratio(self) -> float:
+        """Ours over the peer's: below 1 is faster."""
+        return self.ours_ms / self.peer_ms
+
+
+def median_ms(function: Callable[[], Any], repeats: int) -> float:
+    """Median time of a call, milliseconds, after one call to warm up."""
+    jax.block_until_ready(function())
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append((time.perf_counter() - start) * 1e3)
+    return float(np.median(times))
+
+
+def _first_call_s(function: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - start
+
+
+def _warps(settings: BenchmarkSettings) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(settings.seed)
+    image = rng.uniform(size=(settings.height, settings.width, 5)).astype(np.float32)
+    coarse = rng.normal(0, 4, (6, 8, 2)).astype(np.float32)
+    return image, cv2.resize(coarse, (settings.width, settings.height), interpolation=cv2.INTER_CUBIC)
+
+
+def _gather(settings: BenchmarkSettings) -> Timing:
+    image, flow = _warps(settings)
+    x, y = np.meshgrid(np.arange(settings.width, dtype=np.float32), np.arange(settings.height, dtype=np.float32))
+    run = jax.jit(gather)
+    arguments = jnp.asarray(image), jnp.asarray(flow)
+    compile_s = _first_call_s(lambda: run(*arguments))
+    halves = image[..., :4].copy(), image[..., 4:].copy()  # cv2.remap takes at most four channels
+
+    def peer():
+        for part in halves:
+            cv2.remap(part, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
+
+    what = f"warp.gather, 5 channels, {settings.width}x{settings.height}"
+    ours = median_ms(lambda: run(*arguments), settings.repeats)
+    return Timing(what, ours, "cv2.remap", median_ms(peer, settings.repeats), compile_s)
+
+
+def _splat(settings: BenchmarkSettings) -> Timing:
+    image, flow = _warps(settings)
+    height, width = settings.height, settings.width
+    run = jax.jit(splat)
+    arguments = jnp.asarray(image), jnp.asarray(flow)
+    compile_s = _first_call_s(lambda: run(*arguments))
+
+    def peer():
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        u, v = x + flow[..., 0], y + flow[..., 1]
+        left, top = np.floor(u).astype(int), np.floor(v).astype(int)
+        total = np.zeros((height * width, 6))
+        for dy in (0, 1):
+            for dx in (0, 1):
+                column, row = left + dx, top + dy
+                inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+                weight = (1 - np.abs(u - column)) * (1 - np.abs(v - row)) * inside
+                at = np.where(inside, row * width + column, 0).ravel()
+                for channel in range(5):
+                    value = (weight * image[..., channel]).ravel()
+                    total[:, channel] += np.bincount(at, value, height * width)
+                total[:, 5] += np.bincount(at, weight.ravel(), height * width)
+        return total
+
+    what = f"warp.splat, 5 channels, {width}x{height}"
+    ours = median_ms(lambda: run(*arguments), settings.repeats)
+    return Timing(what, ours, "np.bincount", median_ms(peer, settings.repeats), compile_s)
+
+
+def _segment(settings: BenchmarkSettings) -> Timing:
+    height, width = 120, 160
+    rng = np.random.default_rng(settings.seed)
+    depth = cv2.resize(rng.uniform(1, 5, (6, 8)).astype(np.float32), (width, height))
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, width), np.linspace(-0.4, 0.4, height))
+    points = np.stack([x * depth, y * depth, depth], axis=-1).astype(np.float32)
+    run = jax.jit(lambda p: segment(p, jnp.ones(p.shape[:2], bool), jnp.asarray(0.06), cell=8))
+    given = jnp.asarray(points)
+    compile_s = _first_call_s(lambda: run(given))
+    clusters = (height // 8) * (width // 8)
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, 3, 0.0)
+    samples = points.reshape(-1, 3)
+
+    def peer():
+        cv2.setRNGSeed(0)
+        return cv2.kmeans(samples, clusters, None, stop, 1, cv2.KMEANS_RANDOM_CENTERS)[0]  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+    what = f"segment, {clusters} segments, {width}x{height}, 3 iterations"
+    ours = median_ms(lambda: run(given), settings.repeats)
+    return Timing(what, ours, "cv2.kmeans", median_ms(peer, max(1, settings.repeats // 3)), compile_s)
+
+
+def _coherence(settings: BenchmarkSettings) -> Timing:
+    rng = np.random.default_rng(settings.seed)
+    residual = rng.uniform(0, 2 * np.pi, (300, 64)).astype(np.float32)
+    weight = np.ones((1, 64), np.float32)
+    channel = rng.integers(0, 16, (1, 64)).astype(np.int32)
+    run = jax.jit(lambda r, w, c: coherence(r, w, c, num_channels=16))
+    arguments = jnp.asarray(residual), jnp.asarray(weight), jnp.asarray(channel)
+    compile_s = _first_call_s(lambda: run(*arguments))
+    member = channel[0][:, None] == np.arange(16)
+
+    def peer():
+        return np.abs(np.exp(1j * residual) @ member).sum(axis=1) / 64
+
+    ours = median_ms(lambda: run(*arguments), settings.repeats)
+    return Timing("coherence, 300 motions, 64 reads", ours, "NumPy", median_ms(peer, settings.repeats), compile_s)
+
+
+def _small_recording(settings: BenchmarkSettings):
+    return simulate_recording(SceneSettings(width=320, height=240, num_frames=24), seed=settings.seed)
+
+
+def _radio(settings: BenchmarkSettings) -> Timing:
+    recording = _small_recording(settings)
+    reads = phase_reads(recording.reads, recording.reads.epcs[0], int(recording.time_ns[0]))
+    time_s = jnp.asarray(recording.frame_time_s(), jnp.float32)
+    compile_s = _first_call_s(lambda: radio_windows(reads, time_s, 5, "robust"))
+    ours = median_ms(lambda: radio_windows(reads, time_s, 5, "robust"), settings.repeats)
+    peer = median_ms(lambda: radio_windows(reads, time_s, 5, "paper"), settings.repeats)
+    return Timing(f"robust radio, {recording.num_frames} frames, one tag", ours, "paper's radio", peer, compile_s)
+
+
+def _step(settings: BenchmarkSettings) -> Timing:
+    recording = _small_recording(settings)
+    clip = load_clip(recording, 0, recording.num_frames, stride=2)
+    tracer = TagAttention()
+    run = eqx.filter_jit(trace)
+    compile_s = _first_call_s(lambda: run(tracer, clip.camera, clip.frames).box_px)
+    whole = median_ms(lambda: run(tracer, clip.camera, clip.frames).box_px, settings.repeats)
+    rng = np.random.default_rng(settings.seed)
+    picture = cv2.GaussianBlur((rng.uniform(size=(settings.height, settings.width)) * 255).astype(np.uint8), (0, 0), 3)
+    other = np.roll(picture, 2, axis=1)
+    flow = make_flow("dis")
+    peer = median_ms(lambda: flow(picture, other), settings.repeats)
+    what = f"TagAttention, a frame of 160x120, {len(clip.epcs)} tags"
+    name = f"DIS flow, {settings.width}x{settings.height}, one way"
+    return Timing(what, whole / recording.num_frames, name, peer, compile_s)
+
+
+def _simulate(settings: BenchmarkSettings) -> Timing:
+    scene = SceneSettings(width=settings.width, height=settings.height, num_frames=6, flow=True)
+    start = time.perf_counter()
+    simulate_recording(scene, seed=settings.seed)
+    ours = (time.perf_counter() - start) / scene.num_frames * 1e3
+    return Timing(f"simulated frame, {settings.width}x{settings.height}, truth on", ours, "4 frames/s", 250.0)
+
+
+CASES: Mapping[str, Callable[[BenchmarkSettings], Timing]] = {
+    "gather": _gather,
+    "splat": _splat,
+    "segment": _segment,
+    "coherence": _coherence,
+    "radio": _radio,
+    "step": _step,
+    "simulate": _simulate,
+}
+"""What can be measured, by name."""
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    return {
+        "platform": platform.platform(),
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "load": round(load, 2),
+        "devices": [str(device) for device in jax.devices()],
+        "jax": jax.__version__,
+        "opencv": cv2.__version__,
+    }
+
+
+def run_benchmark(settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None) -> list[Timing]:
+    """Measure every case; `on_case` is told the name of the one that begins."""
+    timings = []
+    for name in settings.cases:
+        if on_case is not None:
+            on_case(name)
+        timings.append(CASES[name](settings))
+    return timings
