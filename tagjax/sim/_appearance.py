@@ -14,7 +14,10 @@ ATLAS_SIZE = 256
 NUM_FIELDS = 4
 _GRIDS = (4, 8, 16, 32, 64, 128)
 # Amplitude of each octave: about 1/f (walls, cloth, skin), nearly white (gravel, print), and coarse cells.
-_OCTAVES = np.float32([[1.0, 0.8, 0.6, 0.45, 0.35, 0.3], [0.1, 0.2, 0.4, 0.7, 1.0, 1.0], [0.2, 0.5, 1.0, 0.9, 0.3, 0.0]])
+_OCTAVES = np.array(
+    [[1.0, 0.8, 0.6, 0.45, 0.35, 0.3], [0.1, 0.2, 0.4, 0.7, 1.0, 1.0], [0.2, 0.5, 1.0, 0.9, 0.3, 0.0]],
+    np.float32,
+)
 
 
 class Surface(eqx.Module):
@@ -23,16 +26,16 @@ class Surface(eqx.Module):
     Leaves are (layers, ...) in a scene and planes (..., height, width) where each pixel has its own layer's.
     """
 
-    base: Float[Array, "..."]  # 3 colours
-    contrast: Float[Array, "..."]  # 3 colours that the pattern adds
-    tints: Float[Array, "..."]  # 4 x 3 colours that each field of the atlas adds
-    shade: Float[Array, "..."]  # relative brightening per pixel, x and y
-    texel: Float[Array, "..."]  # cosine and sine times texels a pixel, offset x and y
-    pattern: Float[Array, "..."]  # kind (0 none, 1 stripes, 2 checker, 3 lines), rate rad/px, wobble px, phase
-    photo: Float[Array, "..."]  # 1 = a photograph instead, its number, its pixels a pixel, offset x and y
+    base: Float[Array, ...]  # 3 colours
+    contrast: Float[Array, ...]  # 3 colours that the pattern adds
+    tints: Float[Array, ...]  # 4 x 3 colours that each field of the atlas adds
+    shade: Float[Array, ...]  # relative brightening per pixel, x and y
+    texel: Float[Array, ...]  # cosine and sine times texels a pixel, offset x and y
+    pattern: Float[Array, ...]  # kind (0 none, 1 stripes, 2 checker, 3 lines), rate rad/px, wobble px, phase
+    photo: Float[Array, ...]  # 1 = a photograph instead, its number, its pixels a pixel, offset x and y
 
 
-def white_noise(shape: tuple[int, ...], *, key: PRNGKeyArray) -> UInt32[Array, "..."]:
+def white_noise(shape: tuple[int, ...], *, key: PRNGKeyArray) -> UInt32[Array, ...]:
     """Random words by hashing their numbers (Wellons' lowbias32, twice, seeded by the key).
 
     `jax.random` takes about 40 ns a word on a CPU core, a third of the whole pair; noise in pictures needs less.
@@ -123,7 +126,7 @@ def paint(
 
 
 def soft_shadow(
-    points: tuple[Float[Array, "height width"], Float[Array, "height width"]], edge: Float[Array, "5"]
+    points: tuple[Float[Array, "height width"], Float[Array, "height width"]], edge: Float[Array, 5]
 ) -> Float[Array, "height width 1"]:
     """Factor by which a shadow with a straight soft edge darkens: normal x, y, its distance and width (px), depth."""
     along = (edge[0] * points[0] + edge[1] * points[1] - edge[2]) / edge[3]
@@ -131,10 +134,10 @@ def soft_shadow(
 
 
 def relight(
-    image: Float[Array, "height width 3"], gain: Float[Array, "3"], offset: Float[Array, ""], gamma: Float[Array, ""]
+    image: Float[Array, "height width 3"], gain: Float[Array, 3], offset: Float[Array, ""], gamma: Float[Array, ""]
 ) -> Float[Array, "height width 3"]:
     """gain image^gamma + offset."""
-    return image ** gamma * gain.reshape(1, 1, 3) + offset
+    return image**gamma * gain.reshape(1, 1, 3) + offset
 
 
 def lens_blur(image: Float[Array, "height width 3"], sigma_px: Float[Array, ""]) -> Float[Array, "height width 3"]:
