@@ -15,6 +15,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
+from .data.clips import check_clip
 from .evaluation.evaluate import ScoreSettings
 from .training.logging import LoggerSettings
 from .training.loop import LoopSettings
@@ -40,6 +41,11 @@ class ClipSettings:
     estimator: Literal["robust", "paper"] = "robust"  # of the tags' distances
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
+
+    def __post_init__(self) -> None:
+        check_clip(stride=self.stride, window=self.window, max_reads=self.max_reads)
+        if self.length < self.window:
+            raise ConfigError(f"length is {self.length}; expected at least the window's {self.window} frames.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,11 +120,31 @@ class EvaluateConfig:
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
     progress: bool = True
 
+    def __post_init__(self) -> None:
+        if self.stride is not None:
+            check_clip(stride=self.stride)
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulateConfig:
+    """Which suite is simulated, and where to; `benchmark` is a suite's settings (`tagjax.sim.suites.Suite`)."""
+
+    benchmark: Mapping[str, Any]
+    out: str = "recordings/benchmark"
+    smoke: bool = False
+    workers: int | None = None
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ConfigError(f"workers is {self.workers}; at least 1 process is needed.")
+
 
 def from_mapping(schema: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
     """An instance of the dataclass `schema` from plain nested values, lists turned into tuples where a tuple is due.
 
-    Raises `ConfigError` for a key that the schema does not know, one that is missing, or a value of another type.
+    Raises `ConfigError` for a key that the schema does not know, one that is missing, a value of another type, or one
+    that the schema itself refuses.
     """
     fields = {field.name: field for field in dataclasses.fields(schema)}  # type: ignore[arg-type]
     unknown = sorted(set(map(str, values)) - set(fields))
@@ -132,6 +158,8 @@ def from_mapping(schema: type[T], values: Mapping[str, Any], *, where: str = "")
         return schema(**given)
     except TypeError as error:
         raise ConfigError(f"{where or schema.__name__}: {error}.") from error
+    except ValueError as error:
+        raise ConfigError(f"{where or schema.__name__}: {error}") from error
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -107,13 +108,22 @@ def undistorted_positions(intrinsics: Intrinsics) -> Float[np.ndarray, "height w
     return np.stack([xd * intrinsics.fx_px + intrinsics.cx_px, yd * intrinsics.fy_px + intrinsics.cy_px], axis=-1)
 
 
+def _bilinear(
+    colour: UInt8[np.ndarray, "height width 3"], where: Sequence[np.ndarray], *, mode: str
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture at (row, column) positions; beyond its edge black ("constant") or the edge ("nearest")."""
+    # For integers SciPy cuts the fraction off, which darkens the picture by half a level.
+    bands = [map_coordinates(colour[..., c], where, np.float32, order=1, mode=mode) for c in range(3)]
+    return np.clip(np.rint(np.stack(bands, axis=-1)), 0, 255).astype(np.uint8)
+
+
 def undistort(
     colour: UInt8[np.ndarray, "height width 3"], depth_m: Float[np.ndarray, "height width"], intrinsics: Intrinsics
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "height width"], Intrinsics]:
     """Colour (bilinear) and depth (nearest: depth must not be mixed) without lens distortion."""
     positions = undistorted_positions(intrinsics)
     where = [positions[..., 1], positions[..., 0]]
-    picture = np.stack([map_coordinates(colour[..., c], where, order=1, cval=0) for c in range(3)], axis=-1)
+    picture = _bilinear(colour, where, mode="constant")
     depth = map_coordinates(depth_m, where, order=0, cval=0)
     return picture, depth, dataclasses.replace(intrinsics, distortion=())
 
@@ -132,7 +142,7 @@ def crop_resize(
     x = left + scale * (np.arange(width) + 0.5) - 0.5
     y = top + scale * (np.arange(height) + 0.5) - 0.5
     where = np.meshgrid(y, x, indexing="ij")
-    picture = np.stack([map_coordinates(colour[..., c], where, order=1, mode="nearest") for c in range(3)], axis=-1)
+    picture = _bilinear(colour, where, mode="nearest")
     depth = map_coordinates(depth_m, where, order=0, mode="nearest")
     scaled = dataclasses.replace(
         intrinsics,

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import optax
 import pytest
+from omegaconf import OmegaConf
 
 from tagjax import config
 from tagjax.config import ConfigError, DataSettings, EvaluateConfig, TrainConfig, build, from_mapping
+from tagjax.evaluation.evaluate import ScoreSettings
 from tagjax.training.loop import LoopSettings
+from tagjax.training.loss import ObjectiveSettings
+
+CONF = Path(__file__).parents[1] / "conf"
 
 LEAST = {"tracer": {"_target_": "tagjax.tagattention.TagAttention"}, "optimizer": {"_target_": "optax.sgd"}}
 
@@ -40,6 +47,11 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"logger": {"mode": "loud"}}, "expected one of 'disabled', 'offline', 'online'"),
         ({"data": {"clips": {"stride": None}}}, "data.clips.stride: found None"),
         ({"data": 3}, "expected keys and values"),
+        ({"data": {"clips": {"stride": 0}}}, r"data\.clips: stride is 0; expected at least 1"),
+        ({"data": {"clips": {"stride": -2}}}, r"data\.clips: stride is -2"),
+        ({"data": {"clips": {"window": 1}}}, r"data\.clips: window is 1; expected at least 2"),
+        ({"data": {"clips": {"max_reads": 0}}}, r"data\.clips: max_reads is 0; expected at least 1"),
+        ({"data": {"clips": {"length": 6, "window": 7}}}, r"length is 6; expected at least the window's 7"),
     ],
 )
 def test_wrong_configuration_names_the_key(given: dict, message: str) -> None:
@@ -53,6 +65,8 @@ def test_missing_keys_and_lengths() -> None:
     assert from_mapping(EvaluateConfig, {"frames": [3, 9]}).frames == (3, 9)
     with pytest.raises(ConfigError, match="found 3 elements; expected 2"):
         from_mapping(EvaluateConfig, {"frames": [3, 9, 2]})
+    with pytest.raises(ConfigError, match="stride is 0; expected at least 1"):
+        from_mapping(EvaluateConfig, {"stride": 0})
     assert from_mapping(DataSettings, {}) == DataSettings()
 
 
@@ -85,3 +99,41 @@ def test_targets_that_are_refused(target: str | None, message: str) -> None:
 def test_unknown_settings_of_a_target_are_refused() -> None:
     with pytest.raises(ConfigError, match="alhpa"):
         build({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
+
+
+def _written(path: str) -> dict[str, Any]:
+    """What a file under conf/ says itself, without what it is composed with."""
+    values = OmegaConf.to_container(OmegaConf.load(CONF / path))
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items() if key not in ("defaults", "hydra")}
+
+
+@pytest.mark.parametrize(
+    ("path", "section", "schema"),
+    [
+        ("objective/coherent.yaml", None, ObjectiveSettings),
+        ("data/default.yaml", None, DataSettings),
+        ("data/default.yaml", "clips", config.ClipSettings),
+        ("data/default.yaml", "simulate", config.SimulateSettings),
+        ("data/default.yaml", "virtual_tag", config.VirtualTagSettings),
+        ("train.yaml", "scores", ScoreSettings),
+        ("evaluate.yaml", "scores", ScoreSettings),
+        ("evaluate.yaml", "virtual_tag", config.VirtualTagSettings),
+    ],
+)
+def test_defaults_in_code_are_those_of_the_files(path: str, section: str | None, schema: type) -> None:
+    """A library user who names no value gets what the command line runs with; every field is in the file."""
+    values = _written(path)
+    chosen = values if section is None else values[section]
+    assert set(chosen) == {field.name for field in dataclasses.fields(schema)}
+    assert from_mapping(schema, chosen) == schema()
+
+
+def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
+    values = _written("evaluate.yaml")
+    assert from_mapping(EvaluateConfig, values) == EvaluateConfig()
+    # A training clip's length and tags mean nothing to an evaluation, which has its own epcs.
+    assert set(values["clips"]) == {field.name for field in dataclasses.fields(config.ClipSettings)} - {
+        "length",
+        "epcs",
+    }

@@ -6,28 +6,21 @@ import dataclasses
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
-import jax
+import cv2
+import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import EvaluateConfig, TrainConfig, from_mapping
+from tagjax.config import EvaluateConfig, TrainConfig, VirtualTagSettings, from_mapping
 from tagjax.data.store import save_recording
 from tagjax.evaluation.run import run_evaluation
 from tagjax.recording import RecordingError, TagReads
 from tagjax.training.run import run_training
-from tagjax.training.sources import join_reads
+from tagjax.training.sources import join_reads, with_virtual_tags
 
 ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture(autouse=True)
-def _defaults_of_jax() -> Iterator[None]:
-    """The main job runs under JAX's own promotion rules, as it does for users."""
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +83,27 @@ def test_the_same_recording_cannot_be_held_out(recordings: list[str], tmp_path: 
     values["data"]["validation"] = values["data"]["recordings"]
     with pytest.raises(RecordingError, match="hold it out"):
         run_training(from_mapping(TrainConfig, values), tmp_path)
+
+
+def test_label_pictures_are_whole_and_of_the_frames_size(tmp_path: Path) -> None:
+    recording = synthetic.recording(3)
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number:08d}.png"), recording.truth.labels[number])
+    tracks = tmp_path / "tracks.csv"
+    rows = [f"{frame + 1},1,0.0,0.0,2.0,2.0,1" for frame in range(3)]
+    tracks.write_text("\n".join(["frame,person,x_m,y_m,z_m,range_m,visible", *rows]))
+    settings = VirtualTagSettings(tracks=str(tracks), labels=str(tmp_path))
+    labelled = with_virtual_tags(dataclasses.replace(recording, truth=None), settings)
+    np.testing.assert_array_equal(labelled.truth.labels[:], recording.truth.labels[:])
+
+    second = tmp_path / "00000001.png"
+    whole = second.read_bytes()
+    second.write_bytes(whole[:-20])  # OpenCV reads this without a word
+    with pytest.raises(RecordingError, match=r"00000001\.png: the picture is cut short"):
+        with_virtual_tags(recording, settings)
+    cv2.imwrite(str(second), recording.truth.labels[1][:, :-1])
+    with pytest.raises(RecordingError, match=r"00000001\.png: a picture of \(24, 31\); expected \(24, 32\)"):
+        with_virtual_tags(recording, settings)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import csv
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +21,7 @@ from tagjax.rf.reads import PhaseReads
 from tagjax.rf.refine import interpolation_weights, refine_path
 from tagjax.rf.resample import resample_polynomial
 from tagjax.rf.unwrap import remove_jump, unwrap_paper
-from tagjax.rf.windows import paper_windows, phase_reads, radio_model, radio_windows, window_reads
+from tagjax.rf.windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
 
 
 def _steps(window, truth):
@@ -194,6 +195,106 @@ def test_refinement_differentiates_implicitly():
     numeric = float(end(jnp.asarray(0.17)) - end(jnp.asarray(0.13))) / 0.04
     assert np.isfinite(exact)
     np.testing.assert_allclose(exact, numeric, rtol=0.1, atol=1e-5)
+
+
+def _double(tree):
+    """Floating leaves in double precision, for finite differences; within an x64 context."""
+    return jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float64) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree
+    )
+
+
+def _with_phases(reads, phase_rad):
+    return eqx.tree_at(lambda r: r.phase_rad, reads, phase_rad)
+
+
+def test_refined_paths_have_the_gradient_of_their_reads(gradients_agree):
+    rng = np.random.default_rng(2)
+    with jax.enable_x64(True):
+        time_s = np.sort(rng.uniform(-0.05, 0.42, 24))  # the outermost reads lie beyond the knots and have no say
+        channel = rng.integers(0, 3, 24)
+        phase = 4 * np.pi * 920e6 / C * (0.4 * time_s + 0.05 * np.sin(6 * time_s)) + rng.normal(0, 0.1, 24)
+        phase[[5, 11]] += np.pi
+        reads = _double(_buffer(time_s, phase, channel=channel, sigma_rad=0.08))
+        knots = jnp.linspace(0, 0.4, 5, dtype=jnp.float64)
+        model = _double(RadioModel())
+
+    @jax.jit
+    def path(phase_rad):
+        # Enough steps to converge: the implicit gradient is that of the minimum.
+        told = _with_phases(reads, phase_rad)
+        return refine_path(told, knots, 0.4 * knots, reference_carrier(told), model, max_steps=40).relative_m[1:]
+
+    with jax.enable_x64(True):
+        slope = np.asarray(jax.jacrev(path)(reads.phase_rad))
+    beyond = (time_s < 0) | (time_s > 0.4)
+    assert 0 < beyond.sum() < 12
+    assert np.abs(slope[:, beyond]).max() == 0.0
+    assert np.abs(slope[:, ~beyond]).max(axis=0).min() > 1e-5  # metres a radian
+    gradients_agree(path, (reads.phase_rad,), atol=1e-5, rtol=1e-3)
+
+
+def test_windowed_distances_have_the_gradient_of_the_phases(gradients_agree):
+    rng = np.random.default_rng(0)
+    table = simulate_reads(rng, smooth_path(rng, 0.8, 1.2), 1.2)
+    with jax.enable_x64(True):
+        single = phase_reads(table, "A", 0, length=table.num_reads)
+        reads, model = _double(single), _double(radio_model(single))
+        frames = jnp.arange(5, 12, dtype=jnp.float64) / 10
+
+    @jax.jit
+    def said(phase_rad):
+        window = robust_windows(_with_phases(reads, phase_rad), frames, 5, model)
+        std_m = jnp.where(jnp.isfinite(window.std_m), window.std_m, 0.0)
+        return jnp.concatenate([window.relative_m[:, 1:], std_m[:, 1:]])
+
+    with jax.enable_x64(True):
+        assert int((said(reads.phase_rad)[len(frames) :, -1] > 0).sum()) >= 5
+    # Phases grow by 4 pi f / c = 38.6 rad/m, so these are about 1 / 38.6 m/rad; the solver stops at a relative 1e-4.
+    gradients_agree(said, (reads.phase_rad,), atol=3e-6, rtol=1e-3, step=1e-5)
+
+
+@pytest.fixture(scope="module")
+def sensitivity():
+    """What windows and the refined path say of reads, with the gradients of all of it, compiled once."""
+    frames, knots = jnp.arange(10, dtype=jnp.float32) / 10, jnp.linspace(0.2, 0.8, 6)
+    fixed, static = eqx.partition(RadioModel(), eqx.is_array)
+
+    def said(given, channel, valid):
+        columns, model = given
+        time_s, phase_rad, carrier_hz, sigma_rad = columns
+        reads = PhaseReads(time_s, phase_rad, carrier_hz, sigma_rad, channel, valid)
+        model = eqx.combine(model, static)
+        window = robust_windows(reads, frames, 5, model)
+        refined = refine_path(reads, knots, 0.1 * knots, reference_carrier(reads), model)
+        std = jnp.where(jnp.isfinite(window.std_m), window.std_m, 0.0)
+        parts = (window.relative_m, std, refined.relative_m, refined.covariance_m2)
+        return sum((jnp.sum(jnp.sin(part)) for part in parts), jnp.zeros(())), window
+
+    taken = jax.jit(jax.value_and_grad(said, has_aux=True))
+
+    def take(reads):
+        columns = (reads.time_s, reads.phase_rad, reads.carrier_hz, reads.sigma_rad)
+        return taken((columns, fixed), reads.channel, reads.valid)
+
+    return take
+
+
+@pytest.mark.parametrize("instant", [None, 0.5, 0.53])  # None: spread over time; 0.5 is a frame's own time
+@pytest.mark.parametrize("number", [0, 1, 2, 32])
+def test_gradients_are_finite_however_few_the_reads(sensitivity, number, instant):
+    rng = np.random.default_rng(number)
+    reads = _buffer(np.full(32, instant) if instant else 0.3 + 0.02 * np.arange(32), rng.uniform(0, 6, 32))
+    reads = eqx.tree_at(lambda r: r.valid, reads, jnp.arange(32) < number)
+    (value, window), gradient = sensitivity(reads)
+    assert np.isfinite(float(value))
+    assert not bool(jnp.isnan(window.std_m).any())
+    for leaf in jax.tree.leaves(gradient):
+        assert bool(jnp.isfinite(leaf).all())
+    of_phases = np.abs(gradient[0][1])
+    assert of_phases[number:].max(initial=0.0) == 0.0
+    if number == 32 and instant is None:
+        assert of_phases.max() > 1e-3
 
 
 def test_robust_steps_have_at_most_a_third_of_the_papers_error():

@@ -170,7 +170,7 @@ def test_training_lowers_the_loss_and_finds_the_objects() -> None:
     before = clip_loss(state.tracer, held_out.camera, held_out.frames, KEY, SETTINGS)
     clips = synthetic.ClipCycle([synthetic.recording(40, seed=s) for s in range(2)])
     numbers: dict[str, float] = {}
-    for _ in range(40):
+    for _ in range(60):  # the first 40 pass on a plateau, where own and other coherence are alike
         state, numbers = train_step(state, [next(clips)], optimizer, SETTINGS)
     after = clip_loss(state.tracer, held_out.camera, held_out.frames, KEY, SETTINGS)
     assert float(after["loss"]) < 0.7 * float(before["loss"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Literal
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..geometry import pixel_rays, range_to_depth
-from ..recording import Recording, RecordingError
+from ..recording import Recording, RecordingError, RecordingWarning
 from ..rf.reads import PhaseReads
 from ..rf.windows import phase_reads, radio_windows, window_reads
 from ..tracer import Camera, Frame
@@ -30,6 +31,54 @@ class Clip(eqx.Module):
     name: str = eqx.field(static=True)
     start: int = eqx.field(static=True)
     stop: int = eqx.field(static=True)
+
+
+def check_clip(*, stride: int = 1, window: int = 2, max_reads: int = 1) -> None:
+    """Raise `ValueError` for a stride, a window or a number of reads that no clip can have."""
+    for name, found, least, meaning in (
+        ("stride", stride, 1, "every n-th pixel is kept"),
+        ("window", window, 2, "motion takes two frames"),
+        ("max_reads", max_reads, 1, "reads of one tag in a window"),
+    ):
+        if found < least:
+            raise ValueError(f"{name} is {found}; expected at least {least} ({meaning}).")
+
+
+def choose_antenna(recording: Recording, epcs: Sequence[str], antenna: int | None = None) -> int:
+    """The antenna (counted from 1) that distances are to: the given one, or the one with the most reads of the tags.
+
+    Only antennas that `antennas_m` places count, and reads of known carrier before others; of equals the first. It is
+    one antenna for all tags, since pixels have one distance. Warns (`RecordingWarning`) of the reads that the other
+    antennas made, which are of no use then. Raises `RecordingError` where no antenna is left.
+    """
+    reads = recording.reads[np.isin(recording.reads.epc, list(epcs))]
+    ports, counts = np.unique(reads.antenna, return_counts=True)
+    made = ", ".join(f"{count} of antenna {port}" for port, count in zip(ports, counts, strict=True)) or "none"
+    num_placed = len(recording.antennas_m)
+    if antenna is None:
+        placed = [int(port) for port in ports if 1 <= port <= num_placed]
+        if not placed:
+            raise RecordingError(
+                f"{recording.name}: reads: {made}; antennas_m places antennas 1 to {num_placed}. Give all places."
+            )
+        told = np.isfinite(reads.carrier_hz)
+        antenna = max(placed, key=lambda p: (np.sum(told & (reads.antenna == p)), np.sum(reads.antenna == p)))
+    elif not 1 <= antenna <= num_placed or antenna not in ports:
+        raise RecordingError(
+            f"{recording.name}: antenna {antenna} asked for; antennas_m places antennas 1 to {num_placed}, and the tags' "
+            f"reads are: {made}. Choose an antenna that has both."
+        )
+    others = int(np.sum(reads.antenna != antenna))
+    if others:
+        unread = [epc for epc in epcs if not np.any((reads.epc == epc) & (reads.antenna == antenna))]
+        warnings.warn(
+            f"{recording.name}: {others} of {reads.num_reads} reads left out (reads: {made}): distances are to antenna "
+            f"{antenna}, and another antenna's say nothing of them."
+            + (f" Without any read are then: {', '.join(unread)}." if unread else ""),
+            RecordingWarning,
+            stacklevel=3,
+        )
+    return antenna
 
 
 def _thin_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
@@ -56,18 +105,22 @@ def load_clip(
     window: int = 5,
     max_reads: int = 64,
     estimator: Estimator = "robust",
+    antenna: int | None = None,
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
     `stride` keeps every n-th pixel in both directions. The radio is estimated from the recording's start, causally, so
-    that a clip in the middle knows its past. Distances are to the antenna of the first read. Raises `RecordingError`
-    for an unknown EPC and `ValueError` for frames outside the recording.
+    that a clip in the middle knows its past. Distances are to one antenna, and the radio uses that antenna's
+    reads only (see `choose_antenna`). Raises `RecordingError` for an unknown EPC or antenna and `ValueError` for frames outside
+    the recording or settings that no clip can have.
     """
+    check_clip(stride=stride, window=window, max_reads=max_reads)
     if not 0 <= start < stop <= recording.num_frames:
         raise ValueError(f"Frames {start} to {stop} asked for; {recording.name} has {recording.num_frames}.")
     named = tuple(recording.resolve_epcs(epcs))
     if not named:
         raise RecordingError(f"{recording.name} holds no tag read: there is nothing to trace.")
+    antenna = choose_antenna(recording, named, antenna)
     intrinsics = recording.intrinsics.scaled(stride)
     depth = recording.depth_metres(slice(start, stop))
     if recording.depth_kind == "range":
@@ -76,19 +129,21 @@ def load_clip(
         ways[:, ::stride, ::stride] / np.float32(stride) for ways in pair_flow(recording, start, stop, flow)
     )
     time_s = jnp.asarray(recording.frame_time_s(), jnp.float32)
-    longest = max(int(np.sum(recording.reads.epc == epc)) for epc in named)
+    heard = recording.reads.antenna == antenna
+    longest = max(int(np.sum((recording.reads.epc == epc) & heard)) for epc in named)
     length = max(256, -(-longest // 256) * 256)
-    buffers = [phase_reads(recording.reads, epc, int(recording.time_ns[0]), length=length) for epc in named]
+    origin_ns = int(recording.time_ns[0])
+    buffers = [phase_reads(recording.reads, epc, origin_ns, length=length, antenna=antenna) for epc in named]
     radio = [radio_windows(reads, time_s, window, estimator) for reads in buffers]
     reads = [_window(reads, time_s, window, max_reads) for reads in buffers]
 
     def per_tag(parts):
         return jax.tree.map(lambda *leaves: jnp.stack([leaf[start:stop] for leaf in leaves], axis=1), *parts)
 
-    antenna = int(recording.reads.antenna[0]) - 1
     return Clip(
         camera=Camera(
-            rays=jnp.asarray(pixel_rays(intrinsics)), antenna_m=jnp.asarray(recording.antennas_m[antenna], jnp.float32)
+            rays=jnp.asarray(pixel_rays(intrinsics)),
+            antenna_m=jnp.asarray(recording.antennas_m[antenna - 1], jnp.float32),
         ),
         frames=Frame(
             time_s=time_s[start:stop],
@@ -147,12 +202,18 @@ def clip_dataset(
     flow: str = "dis",
     window: int = 5,
     max_reads: int = 64,
+    antenna: int | None = None,
     step: int | None = None,
 ) -> grain.IterDataset:
     """An endless, shuffled stream of clips; the same seed gives the same order.
 
     Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None).
+    Raises `RecordingError` if no recording is as long as a clip, `ValueError` for settings that no clip can have.
     """
+    check_clip(stride=stride, window=window, max_reads=max_reads)
+    for name, found in (("clip_length", clip_length), ("step", 1 if step is None else step)):
+        if found < 1:
+            raise ValueError(f"{name} is {found}; expected at least 1 frame.")
     source = _ClipSource(
         recordings,
         clip_length,
@@ -162,6 +223,7 @@ def clip_dataset(
         flow=flow,
         window=window,
         max_reads=max_reads,
+        antenna=antenna,
     )
     dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()
     return dataset.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=2))

@@ -22,8 +22,8 @@ from ..recording import ClockAudit, Intrinsics, Recording, RecordingError, TagRe
 FORMAT = "tagjax-recording"
 VERSION = 1
 
-_TRUTH_ARRAYS = ("labels", "flow_px", "occluded")
-_TRUTH_TABLES = ("tag_range_m", "tag_position_m", "visible")
+_TRUTH_ARRAYS = ("labels", "flow_px", "occluded", "backward_flow_px", "backward_occluded")
+_TRUTH_TABLES = ("tag_range_m", "tag_position_m", "visible", "line_of_sight")
 _READ_SETTINGS = ("hop_table_hz", "phase_period_rad", "phase_sign", "pi_flips")
 _READ_COLUMNS = tuple(field.name for field in dataclasses.fields(TagReads) if field.name not in _READ_SETTINGS)
 
@@ -268,7 +268,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
     if attributes["truth"] is not None:
         tables: dict[str, dict[Any, np.ndarray]] = {}
         for name in _TRUTH_TABLES:
-            keys = attributes["truth"][name]
+            keys = attributes["truth"].get(name, ())  # line_of_sight came later
             tables[name] = {key: array(f"truth/{name}/{number}")[...] for number, key in enumerate(keys)}
         truth = Truth(
             **{name: array(f"truth/{name}") for name in _TRUTH_ARRAYS if has(f"truth/{name}")},  # type: ignore[arg-type]

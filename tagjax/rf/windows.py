@@ -30,14 +30,17 @@ _PAST_KNOTS = 3
 _PAST_SPACING_S = 0.1
 
 
-def phase_reads(reads: TagReads, epc: str, origin_ns: int, *, length: int | None = None) -> PhaseReads:
+def phase_reads(
+    reads: TagReads, epc: str, origin_ns: int, *, length: int | None = None, antenna: int | None = None
+) -> PhaseReads:
     """The reads of one tag as a device buffer; times in seconds from `origin_ns`.
 
-    Reads of unknown carrier are left out. The length is padded to a multiple of 256 unless given, so that tags and
+    Reads of unknown carrier are left out, and those of other antennas than `antenna` (counted from 1) if it is given:
+    a path is the distance to one place, so reads of several antennas are no path. The length is padded to a multiple of 256 unless given, so that tags and
     recordings share compiled code. An EPC that was never read raises `RecordingError`.
     """
     own = reads.select(epc)
-    own = own[np.isfinite(own.carrier_hz)]
+    own = own[np.isfinite(own.carrier_hz) & (antenna is None or own.antenna == antenna)]
     count = own.num_reads
     size = length or max(_LENGTH_STEP, -(-count // _LENGTH_STEP) * _LENGTH_STEP)
     if count > size:
@@ -88,7 +91,7 @@ def _reads_between(
     """The newest `max_reads` reads of [first_s, last_s] in a buffer of that length."""
     stamps = jnp.where(reads.valid, reads.time_s, jnp.inf)
     end = jnp.searchsorted(stamps, last_s, side="right")
-    index = end - max_reads + jnp.arange(max_reads)
+    index = end - max_reads + jnp.arange(max_reads, dtype=end.dtype)
     clipped = jnp.clip(index, 0, reads.time_s.shape[0] - 1)
     picked = jax.tree.map(lambda leaf: leaf[clipped], reads)
     inside = (index >= 0) & picked.valid & (picked.time_s >= first_s)

@@ -29,13 +29,13 @@ class ObjectiveSettings:
     coverage: float = 0.3
     temperature: float = 0.1  # of the contrast, in units of coherence
     num_shifts: int = 4  # time-shifted copies of the own motion among the negatives
-    span_frames: int = 10  # coherence is taken over pieces this long: drift of the sum does not reach further
-    skip_frames: int = 5  # at the start of a clip, while the tracer has not seen a full window
+    span_frames: int = 6  # coherence is taken over pieces this long: drift of the sum does not reach further
+    skip_frames: int = 12  # at the start of a clip, while the tracer has not seen enough
     min_reads: int = 6  # a piece with fewer reads says nothing
     rest_margin: float = 0.05  # a piece whose reads lose less coherence than this by taking the tag to rest is left out
     max_reads: int = 384  # reads of one tag in a clip
     num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
-    multiple: int = 2  # 2 takes phases modulo pi: right whether the reader flips or not
+    multiple: int = 1  # 2 takes phases modulo pi: right whether the reader flips or not, but ambiguous twice as soon
     future_alpha_m2: float = 1e-3  # a pixel agrees with the future if it is within about the root of this
     future_stride: int = 2  # every n-th working pixel is asked
     rematerialise: bool = True  # keep only the tracer's states for the backward pass

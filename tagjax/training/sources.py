@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..config import ClipSettings, DataSettings, SimulateSettings, VirtualTagSettings
 from ..data.clips import Clip, load_clip
+from ..data.importers.rgbd_folder import read_labels
 from ..data.store import open_recording, save_recording
 from ..recording import Recording, RecordingError, TagReads, Truth
 
@@ -129,9 +129,8 @@ def _labelled(recording: Recording, folder: Path) -> Truth:
         raise RecordingError(
             f"{folder}: {len(files)} PNG files; expected {recording.num_frames}, one a frame of {recording.name}."
         )
-    masks = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
+    masks = [read_labels(file) for file in files]
     for file, mask in zip(files, masks, strict=True):
-        if mask is None or mask.shape != recording.image_shape:
-            found = "unreadable" if mask is None else mask.shape
-            raise RecordingError(f"{file}: {found}; expected a grey picture of {recording.image_shape}.")
+        if mask.shape != recording.image_shape:
+            raise RecordingError(f"{file}: a picture of {mask.shape}; expected {recording.image_shape} as the frames.")
     return dataclasses.replace(recording.truth or Truth(), labels=np.stack(masks))  # type: ignore[arg-type]

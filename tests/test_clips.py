@@ -1,0 +1,134 @@
+"""Clips: settings that no clip can have, and recordings with the reads of several antennas."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import synthetic_clips as synthetic
+
+from tagjax._numerics import SPEED_OF_LIGHT_M_S
+from tagjax.data.clips import choose_antenna, clip_dataset, load_clip
+from tagjax.recording import Recording, RecordingError, RecordingWarning
+from tagjax.training.sources import join_reads
+
+ANTENNAS_M = np.array([[0.0, 0.0, 0.0], [0.5, -0.3, 4.0], [9.0, 9.0, 9.0]])
+SMALL = {"stride": 2, "flow": "dis_ultrafast"}
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return synthetic.enlarged(synthetic.recording(20), 4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"stride": 0}, "stride is 0; expected at least 1"),
+        ({"stride": -3}, "stride is -3; expected at least 1"),
+        ({"window": 1}, "window is 1; expected at least 2"),
+        ({"max_reads": 0}, "max_reads is 0; expected at least 1"),
+    ],
+)
+def test_settings_that_no_clip_can_have_are_refused(recording: Recording, settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_clip(recording, 0, 6, **{**SMALL, **settings})
+    with pytest.raises(ValueError, match=message):
+        clip_dataset([recording], clip_length=6, seed=0, **{**SMALL, **settings})
+
+
+@pytest.mark.parametrize(("name", "found"), [("clip_length", 0), ("step", 0), ("step", -1)])
+def test_datasets_of_no_length_are_refused(recording: Recording, name: str, found: int) -> None:
+    with pytest.raises(ValueError, match=f"{name} is {found}; expected at least 1 frame"):
+        clip_dataset([recording], seed=0, **{**SMALL, "clip_length": 6, name: found})
+
+
+def _two_antennas(recording: Recording, share: float, epcs: tuple[str, ...] = ("tag-a", "tag-b")) -> Recording:
+    """With a `share` as many reads again by antenna 2, before the object: the distance to it shrinks as the other's grows.
+
+    The first read is antenna 2's.
+    """
+    own = recording.reads
+    rng = np.random.default_rng(0)
+    chosen = np.isin(own.epc, epcs) & (rng.random(own.num_reads) < share)
+    chosen[0] = True
+    other = own[chosen]
+    time_s = other.time_ns * 1e-9
+    offset = np.where(other.epc == "tag-a", synthetic.offset_m(1, time_s), synthetic.offset_m(2, time_s))
+    phase = np.mod(4 * np.pi * other.carrier_hz / SPEED_OF_LIGHT_M_S * (2.0 - offset) + 1.0, 2 * np.pi)
+    other = dataclasses.replace(
+        other, antenna=np.full(other.num_reads, 2, np.int16), phase_rad=phase, time_ns=other.time_ns - 1_000_000
+    )
+    return dataclasses.replace(recording, reads=join_reads([own, other]), antennas_m=ANTENNAS_M)
+
+
+def _same_radio(one, other) -> None:
+    for name in ("relative_m", "std_m"):
+        np.testing.assert_array_equal(getattr(one.frames.radio, name), getattr(other.frames.radio, name))
+    np.testing.assert_array_equal(one.frames.reads.valid, other.frames.reads.valid)
+    np.testing.assert_array_equal(one.frames.reads.phase_rad, other.frames.reads.phase_rad)
+
+
+def test_only_the_antenna_with_the_most_reads_counts(recording: Recording) -> None:
+    both = _two_antennas(recording, 0.6)
+    assert both.reads.antenna[0] == 2
+    surplus = both.reads.num_reads - recording.reads.num_reads
+    with pytest.warns(RecordingWarning, match=rf"{surplus} of {both.reads.num_reads} reads left out .* to antenna 1,"):
+        clip = load_clip(both, 4, 20, **SMALL)
+    np.testing.assert_array_equal(clip.camera.antenna_m, ANTENNAS_M[0])
+    _same_radio(clip, load_clip(recording, 4, 20, **SMALL))
+    truth = np.diff(np.stack([recording.truth.tag_range_m[epc] for epc in clip.epcs], axis=1), axis=0)[3:]
+    steps = np.asarray(clip.frames.radio.relative_m)
+    np.testing.assert_allclose((steps[..., -1] - steps[..., -2])[4:], truth[4:], atol=5e-3)
+
+
+def test_a_named_antenna_is_obeyed(recording: Recording) -> None:
+    both = _two_antennas(recording, 0.9)
+    with pytest.warns(RecordingWarning, match=f"{recording.reads.num_reads} of .* to antenna 2,"):
+        clip = load_clip(both, 4, 20, antenna=2, **SMALL)
+    np.testing.assert_allclose(clip.camera.antenna_m, ANTENNAS_M[1], atol=1e-6)
+    truth = -np.diff(np.stack([recording.truth.tag_range_m[epc] for epc in clip.epcs], axis=1), axis=0)[3:]
+    steps = np.asarray(clip.frames.radio.relative_m)
+    np.testing.assert_allclose((steps[..., -1] - steps[..., -2])[4:], truth[4:], atol=5e-3)
+    with pytest.warns(RecordingWarning, match="to antenna 2,"):
+        first = next(iter(clip_dataset([both], clip_length=6, seed=0, antenna=2, **SMALL)))
+    np.testing.assert_allclose(first.camera.antenna_m, ANTENNAS_M[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("antenna", [0, 3, 4])
+def test_an_antenna_without_place_or_reads_is_refused(recording: Recording, antenna: int) -> None:
+    both = _two_antennas(recording, 0.5)
+    with pytest.raises(RecordingError, match=rf"antenna {antenna} asked for; .*antennas 1 to 3.*of antenna 2"):
+        load_clip(both, 0, 6, antenna=antenna, **SMALL)
+
+
+def test_antennas_without_place_are_passed_over(recording: Recording) -> None:
+    moved = recording.with_reads(dataclasses.replace(recording.reads, antenna=np.full_like(recording.reads.antenna, 2)))
+    with pytest.raises(RecordingError, match="of antenna 2; antennas_m places antennas 1 to 1"):
+        load_clip(moved, 0, 6, **SMALL)
+    both = _two_antennas(recording, 0.4)
+    swapped = dataclasses.replace(both.reads, antenna=(3 - both.reads.antenna).astype(np.int16))  # most are now 2's
+    with pytest.warns(RecordingWarning, match="to antenna 1,"):
+        assert choose_antenna(dataclasses.replace(both, reads=swapped, antennas_m=ANTENNAS_M[:1]), ["tag-a"]) == 1
+
+
+def test_one_antenna_serves_all_tags_and_says_whom_it_does_not_read(recording: Recording) -> None:
+    both = _two_antennas(recording, 1.0)
+    apart = (both.reads.epc == "tag-b") == (both.reads.antenna == 2)  # tag-a by antenna 1 only, tag-b by antenna 2
+    split = both.with_reads(both.reads[apart][:-20])  # as many reads of both: the first antenna
+    with pytest.warns(RecordingWarning, match="to antenna 1, .* Without any read are then: tag-b"):
+        clip = load_clip(split, 0, 12, **SMALL)
+    at = clip.epcs.index("tag-b")
+    np.testing.assert_array_equal(clip.camera.antenna_m, ANTENNAS_M[0])
+    assert np.isinf(np.asarray(clip.frames.radio.std_m)[:, at]).all()
+    assert not np.asarray(clip.frames.reads.valid)[:, at].any()
+    assert np.isfinite(np.asarray(clip.frames.radio.std_m)[-1, 1 - at]).all()
+
+
+def test_reads_of_unknown_carrier_do_not_choose_the_antenna(recording: Recording) -> None:
+    both = _two_antennas(recording, 0.5)
+    carrier = np.where(both.reads.antenna == 1, np.nan, both.reads.carrier_hz)
+    unknown = both.with_reads(dataclasses.replace(both.reads, carrier_hz=carrier))
+    with pytest.warns(RecordingWarning, match="to antenna 2,"):
+        assert choose_antenna(unknown, unknown.reads.epcs) == 2
