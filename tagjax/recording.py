@@ -187,6 +187,10 @@ class Truth:
     visible: Mapping[int, np.ndarray] = dataclasses.field(default_factory=dict)  # label: (num_frames,) bool
     flow_px: LazyArray | None = None  # (num_frames, height, width, 2) flow from frame t to t + 1; last one NaN
     occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is hidden
+    backward_flow_px: LazyArray | None = None  # (num_frames, height, width, 2) from frame t to t - 1; first one NaN
+    backward_occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is hidden
+    line_of_sight: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,) share of
+    # the field that reaches the first antenna straight: 1 free, 0 blocked
 
     IGNORE = 255
 

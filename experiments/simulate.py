@@ -1,0 +1,69 @@
+"""Simulate a benchmark suite: the same name and seed give the same recordings; what is there already is kept.
+
+python -m experiments.simulate benchmark=multi_4
+python -m experiments.simulate benchmark=corpus benchmark.counts.train=200 out=recordings/corpus workers=8
+python -m experiments.simulate benchmark=crowd smoke=true out=recordings/smoke
+"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="simulate")
+def main(config: DictConfig) -> None:
+    import os
+    from pathlib import Path
+
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from tagjax.config import SimulateConfig, from_mapping
+    from tagjax.recording import RecordingError
+    from tagjax.sim.suites import Suite, make_suite
+
+    values = resolved(config)
+    if values["benchmark"] is None:
+        raise SystemExit("simulate: name a suite: benchmark=<name>. `--help` lists them.")
+    checked = from_mapping(SimulateConfig, values)
+    suite = from_mapping(Suite, checked.benchmark, where="benchmark")
+    suite = suite.smoke() if checked.smoke else suite
+    console = Console()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    total = len(suite.items())
+    with Progress(*columns, console=console, disable=not checked.progress) as bar:
+        task = bar.add_task(suite.name, total=total)
+        here = sum(item.path(Path(checked.out)).exists() for item in suite.items())
+        bar.update(task, completed=here)
+        try:
+            made = make_suite(
+                suite,
+                Path(checked.out),
+                workers=checked.workers or os.cpu_count() or 1,
+                on_done=lambda one: bar.update(task, advance=1, description=one.name),
+            )
+        except (RecordingError, ValueError) as error:
+            raise SystemExit(f"simulate: {error}") from error
+    frames, elapsed_s = sum(one.num_frames for one in made), sum(one.elapsed_s for one in made)
+    pace = f", {frames / elapsed_s:.1f} frames/s a process" if frames else ""
+    console.print(f"{suite.name}: {len(made)} made, {total - len(made)} there already, in {checked.out}{pace}")
+
+
+if __name__ == "__main__":
+    main()

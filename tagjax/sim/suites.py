@@ -1,0 +1,220 @@
+"""Benchmark suites: which stories are told how often, for training, validation and test, and made on many cores."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import multiprocessing
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..data.store import save_recording
+from ..recording import RecordingError
+from .planar import PlanarSettings, planar_trials, save_planar
+from .record import CaptureSettings, Filmed, film
+from .stories import STORIES, tell
+
+SPLITS = ("train", "validation", "test")
+
+PLANAR = "planar_101"
+"""The one story that has no picture."""
+
+MANIFEST = "suite.json"
+
+_VERSION = 1
+_DRAWS = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One condition of a suite: its name, and what differs from the suite's settings."""
+
+    name: str
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    capture: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Counts:
+    """Recordings of each variant in each split."""
+
+    train: int = 2
+    validation: int = 1
+    test: int = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """A named experiment: everything that its recordings follow from."""
+
+    name: str
+    about: str
+    paper: str
+    story: str
+    seed: int
+    duration_s: float = 5.0
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    capture: CaptureSettings = dataclasses.field(default_factory=CaptureSettings)
+    variants: tuple[Variant, ...] = (Variant("all"),)
+    counts: Counts = dataclasses.field(default_factory=Counts)
+
+    def __post_init__(self):
+        if self.story != PLANAR and self.story not in STORIES:
+            raise ValueError(f"{self.name}: unknown story {self.story!r}; known are {', '.join([*STORIES, PLANAR])}.")
+        if not self.duration_s > 0:
+            raise ValueError(f"{self.name}: duration_s is {self.duration_s}; a positive one is needed.")
+        if min(dataclasses.astuple(self.counts)) < 0 or not self.variants:
+            raise ValueError(f"{self.name}: counts {self.counts}, {len(self.variants)} variants; expected some.")
+        names = [variant.name for variant in self.variants]
+        if len(set(names)) != len(names):
+            raise ValueError(f"{self.name}: variants share a name: {', '.join(names)}.")
+
+    def smoke(self) -> Suite:
+        """The suite in small, for tests: pictures 64 pixels wide, two seconds or so, one test recording a variant."""
+        capture = dataclasses.replace(self.capture, width=64, frame_rate_hz=min(self.capture.frame_rate_hz, 5.0))
+        return dataclasses.replace(self, duration_s=min(self.duration_s, 2.4), capture=capture, counts=Counts(0, 0, 1))
+
+    def items(self) -> list[Item]:
+        """Every recording of the suite."""
+        found = []
+        for split, (index, variant) in itertools.product(range(len(SPLITS)), enumerate(self.variants)):
+            for number in range(dataclasses.astuple(self.counts)[split]):
+                source = np.random.SeedSequence([self.seed, split, index, number])
+                seed = int(source.generate_state(1)[0])
+                found.append(Item(self, variant, SPLITS[split], number, seed))
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Item:
+    """One recording of a suite."""
+
+    suite: Suite
+    variant: Variant
+    split: str
+    number: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.suite.name}-{self.variant.name}-{self.split}-{self.number}"
+
+    def path(self, folder: Path) -> Path:
+        """Where it lies within the output folder."""
+        return folder / self.suite.name / self.split / f"{self.name}.zarr"
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """What making one recording took."""
+
+    name: str
+    num_frames: int
+    elapsed_s: float
+
+
+def stage_item(item: Item) -> Filmed:
+    """The world of a recording: the first of a few draws in which everything finds its place.
+
+    Raises `ValueError` with the last draw's reason if none does.
+    """
+    settings = {**item.suite.settings, **item.variant.settings}
+    for draw in range(_DRAWS):
+        try:
+            filmed = tell(item.suite.story, np.random.default_rng([item.seed, draw]), item.suite.duration_s, settings)
+            filmed.world.check()
+        except ValueError as error:
+            if draw == _DRAWS - 1:
+                raise ValueError(
+                    f"{item.name} (seed {item.seed}), {_DRAWS} draws in vain; the last: {error}"
+                ) from error
+        else:
+            return filmed
+    raise AssertionError("a draw returns or raises")
+
+
+def make_item(item: Item, folder: Path) -> Made:
+    """Simulate one recording and write it; it appears whole or not at all."""
+    start = time.perf_counter()
+    path = item.path(folder)
+    if item.suite.story == PLANAR:
+        settings = {**item.suite.settings, **item.variant.settings}
+        partial = path.with_name(f".{path.name}.partial")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)
+        save_planar(planar_trials(PlanarSettings(**settings), seed=item.seed), partial)
+        os.replace(partial, path)
+        return Made(item.name, 0, time.perf_counter() - start)
+    capture = dataclasses.replace(item.suite.capture, **item.variant.capture)
+    recording = film(stage_item(item), capture, seed=item.seed, name=item.name)
+    save_recording(recording, path)
+    return Made(item.name, recording.num_frames, time.perf_counter() - start)
+
+
+def prepare(suite: Suite, folder: Path) -> list[Item]:
+    """Check the output folder and say which recordings are still to be made; partial ones of a killed run are removed.
+
+    Raises `RecordingError`, and touches nothing, where the folder holds something else or another version of the suite.
+    """
+    home = folder / suite.name
+    manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
+    if home.exists():
+        try:
+            found = json.loads((home / MANIFEST).read_text())
+        except (OSError, ValueError) as error:
+            raise RecordingError(
+                f"{home} holds something else (no readable {MANIFEST}). Name another folder with out=."
+            ) from error
+        if found != manifest:
+            differs = sorted(key for key in {*found, *manifest} if found.get(key) != manifest.get(key))
+            raise RecordingError(
+                f"{home} holds this suite with other settings ({', '.join(differs)}). Name another folder with out=."
+            )
+    else:
+        home.mkdir(parents=True)
+        (home / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
+    for partial in home.glob("*/.*.partial"):
+        shutil.rmtree(partial, ignore_errors=True)
+    return [item for item in suite.items() if not item.path(folder).exists()]
+
+
+def make_suite(
+    suite: Suite, folder: Path, *, workers: int = 1, on_done: Callable[[Made], None] | None = None
+) -> list[Made]:
+    """Make what is missing of a suite; finished recordings are kept, whatever happens to the rest.
+
+    Each recording follows from its seed alone, so the number of workers changes nothing in it.
+    """
+    todo = prepare(suite, folder)
+    made: list[Made] = []
+
+    def finished(one: Made) -> None:
+        made.append(one)
+        if on_done is not None:
+            on_done(one)
+
+    if workers <= 1 or len(todo) <= 1:
+        for item in todo:
+            finished(make_item(item, folder))
+        return made
+    # Spawned, not forked: JAX's threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(todo)), mp_context=context) as pool:
+        waiting = {pool.submit(make_item, item, folder) for item in todo}
+        try:
+            while waiting:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in done:
+                    finished(future.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return made
