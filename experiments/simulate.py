@@ -31,6 +31,7 @@ def main(config: DictConfig) -> None:
     from tagjax.config import SimulateConfig, from_mapping
     from tagjax.recording import RecordingError
     from tagjax.sim.suites import Suite, make_suite
+    from tagjax.viz.contact_sheet import save_sheet
 
     values = resolved(config)
     if values["benchmark"] is None:
@@ -62,7 +63,10 @@ def main(config: DictConfig) -> None:
             raise SystemExit(f"simulate: {error}") from error
     frames, elapsed_s = sum(one.num_frames for one in made), sum(one.elapsed_s for one in made)
     pace = f", {frames / elapsed_s:.1f} frames/s a process" if frames else ""
-    console.print(f"{suite.name}: {len(made)} made, {total - len(made)} there already, in {checked.out}{pace}")
+    sheet = save_sheet(suite, Path(checked.out))
+    console.print(
+        f"{suite.name}: {len(made)} made, {total - len(made)} there already, in {checked.out}{pace}; {sheet.name}"
+    )
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ class ClipSettings:
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
     estimator: Literal["robust", "paper"] = "robust"  # of the tags' distances
+    antenna: int | None = None  # that distances are to; the one with the most reads if None
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
 

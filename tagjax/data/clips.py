@@ -202,6 +202,7 @@ def clip_dataset(
     flow: str = "dis",
     window: int = 5,
     max_reads: int = 64,
+    estimator: Estimator = "robust",
     antenna: int | None = None,
     step: int | None = None,
 ) -> grain.IterDataset:
@@ -223,6 +224,7 @@ def clip_dataset(
         flow=flow,
         window=window,
         max_reads=max_reads,
+        estimator=estimator,
         antenna=antenna,
     )
     dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()

@@ -60,8 +60,14 @@ class _Set:
         low, high = np.array([0.0, 0.3 - width / 2, 0.0]), np.array([length - 0.3, width / 2 - 0.3, np.inf])
         return np.clip(path_m, low, high)
 
-    def filmed(self, note: str, *, look_at_m: Sequence[float] | None = None, **inventory: Any) -> Filmed:
+    def filmed(
+        self, note: str, *, look_at_m: Sequence[float] | None = None, num_antennas: int = 1, **inventory: Any
+    ) -> Filmed:
         room = self.room
+        if not 1 <= num_antennas <= len(room.antennas_m):
+            raise ValueError(
+                f"{num_antennas} antennas asked for; the {room.name} has places for {len(room.antennas_m)}."
+            )
         world = World(
             bodies=tuple(self.bodies),
             tags=tuple(self.tags),
@@ -77,7 +83,7 @@ class _Set:
             world,
             room.camera_position_m,
             (float(x), float(y), float(z)),
-            room.antennas_m,
+            room.antennas_m[:num_antennas],
             room.panels,
             InventorySettings(**inventory),
         )
@@ -151,6 +157,7 @@ def handheld(
     one_grip: bool = False,
     passing: bool = False,
     num_still_tags: int = 0,
+    num_antennas: int = 1,
     distance_m: Sequence[float] = (1.7, 2.3),
 ) -> Filmed:
     """People before the camera wave an object in each hand, at rest for `still_s` first
@@ -190,7 +197,7 @@ def handheld(
     _walkers(stage, rng, num_walkers, duration_s, places)
     _still_tags(stage, rng, num_still_tags)
     middle = np.mean(places, axis=0)
-    return stage.filmed("people wave objects", look_at_m=(middle[0], 0.8 * middle[1], 1.1))
+    return stage.filmed("people wave objects", look_at_m=(middle[0], 0.8 * middle[1], 1.1), num_antennas=num_antennas)
 
 
 def _together(stage: _Set, models: Sequence[ObjectModel], hand: Poses) -> None:
@@ -500,7 +507,9 @@ def shop_exit(
             lift = 0.22 * (number // 2)
             stage.object(model, Poses(pose.position_m + np.array([0.0, 0.0, lift]), pose.quaternion))
     _still_tags(stage, rng, num_still_tags)
-    return stage.filmed(f"{num_people} people, {tags_each} tags each, {num_still_tags} still", rounds_per_antenna=2)
+    return stage.filmed(
+        f"{num_people} people, {tags_each} tags each, {num_still_tags} still", num_antennas=3, rounds_per_antenna=2
+    )
 
 
 def grid(
@@ -525,7 +534,7 @@ def grid(
     line = _fit(np.array(path), stage.steps)
     place = np.column_stack([line, np.full(stage.steps, height_m)])
     stage.object(model, Poses(place, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (stage.steps, 4)).copy()))
-    return stage.filmed("a tag rests at each point of a grid", rounds_per_antenna=2)
+    return stage.filmed("a tag rests at each point of a grid", num_antennas=3, rounds_per_antenna=2)
 
 
 STORIES: Mapping[str, Callable[..., Filmed]] = {

@@ -58,6 +58,8 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
             flow=clips.flow,
             window=clips.window,
             max_reads=clips.max_reads,
+            estimator=clips.estimator,
+            antenna=clips.antenna,
             seed=config.seed,
         )
     )

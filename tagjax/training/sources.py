@@ -30,6 +30,7 @@ def clip_loader(settings: ClipSettings) -> Callable[..., Clip]:
             window=settings.window,
             max_reads=settings.max_reads,
             estimator=settings.estimator,
+            antenna=settings.antenna,
         )
 
     return load
