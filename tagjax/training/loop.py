@@ -35,10 +35,10 @@ class ClipIterator(Protocol):
 class LoopSettings:
     """How long, and how often what is written."""
 
-    num_steps: int = 20
+    num_steps: int = 14
     batch_size: int = 1  # clips whose gradients are averaged in a step
-    checkpoint_every: int = 10
-    validate_every: int = 10
+    checkpoint_every: int = 7
+    validate_every: int = 7
     log_every: int = 1
     progress: bool = True
 
