@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8, UInt32
 
-from tagjax.sim._layers import wave
+from ._layers import wave
 
 ATLAS_SIZE = 256
 NUM_FIELDS = 4

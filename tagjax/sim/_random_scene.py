@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from tagjax.sim import _appearance as look
-from tagjax.sim import _layers as geometry
+from . import _appearance as look
+from . import _layers as geometry
 
 _NUM_ROWS = 96  # uniform numbers for each layer, and for the scene; more than are used
 _SHARES = ("still_scene_share", "still_camera_share", "still_layer_share", "bend_share", "dull_share", "photo_share",

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
-from tagjax.image.warp import pixel_grid
-from tagjax.sim import _appearance as look
-from tagjax.sim import _layers as geometry
-from tagjax.sim._random_scene import FlowPairSettings, Scene, draw_scene
+from ..image.warp import pixel_grid
+from . import _appearance as look
+from . import _layers as geometry
+from ._random_scene import FlowPairSettings, Scene, draw_scene
 
 __all__ = ["FlowPair", "FlowPairSettings", "flow_pair", "flow_pairs"]
 

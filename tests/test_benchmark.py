@@ -1,0 +1,29 @@
+"""The benchmark measures what it names, and refuses what it does not know."""
+
+from __future__ import annotations
+
+import pytest
+
+from tagjax.config import ConfigError, from_mapping
+from tagjax.evaluation.benchmark import CASES, BenchmarkSettings, machine, run_benchmark
+
+
+def test_cases_give_times_of_both_and_their_ratio():
+    told: list[str] = []
+    settings = BenchmarkSettings(cases=("gather", "coherence"), height=48, width=64, repeats=2)
+    timings = run_benchmark(settings, on_case=told.append)
+    assert told == ["gather", "coherence"]
+    for timing in timings:
+        assert timing.ours_ms > 0
+        assert timing.peer_ms > 0
+        assert timing.ratio == pytest.approx(timing.ours_ms / timing.peer_ms)
+    assert "64x48" in timings[0].what
+    assert machine()["cores"] >= 1
+
+
+def test_unknown_cases_and_empty_pictures_are_refused():
+    with pytest.raises(ConfigError, match="Unknown benchmark warp; there are gather, splat"):
+        from_mapping(BenchmarkSettings, {"cases": ["warp"]})
+    with pytest.raises(ValueError, match="at least 32x32"):
+        BenchmarkSettings(height=1)
+    assert set(BenchmarkSettings().cases) == set(CASES)
