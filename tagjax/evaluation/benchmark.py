@@ -211,10 +211,10 @@ def _simulate(settings: BenchmarkSettings) -> Timing:
 
     The first frame, which renders what never moves, is left out; reads are too.
     """
-    filmed = tell("handheld", np.random.default_rng(settings.seed), 1.0, {"room": "office", "num_walkers": 1})
+    filmed = tell("handheld", np.random.default_rng(settings.seed), 2.0, {"room": "office", "num_walkers": 1})
     filmed = dataclasses.replace(filmed, world=dataclasses.replace(filmed.world, tags=()))
     stamps: list[float] = []
-    capture = CaptureSettings(width=settings.width, flow=True, frame_rate_hz=20.0)
+    capture = CaptureSettings(width=settings.width, flow=True, frame_rate_hz=15.0)
     film(filmed, capture, seed=settings.seed, name="benchmark", on_frame=lambda: stamps.append(time.perf_counter()))
     ours = float(np.median(np.diff(stamps))) * 1e3
     height = capture.intrinsics().height
