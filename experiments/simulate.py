@@ -34,7 +34,7 @@ def main(config: DictConfig) -> None:
     from tagjax.viz.contact_sheet import save_sheet
 
     values = resolved(config)
-    if values["benchmark"] is None:
+    if values.get("benchmark") is None:
         raise SystemExit("simulate: name a suite: benchmark=<name>. `--help` lists them.")
     checked = from_mapping(SimulateConfig, values)
     suite = from_mapping(Suite, checked.benchmark, where="benchmark")

@@ -191,6 +191,19 @@ def test_the_same_seed_films_the_same_bytes():
     assert not np.array_equal(one.colour, another.colour)
 
 
+def test_two_objects_in_one_place_are_refused(told):
+    first = _object(told, 0)
+    twin = dataclasses.replace(first, name="twin", label=9)
+    world = dataclasses.replace(told.world, bodies=(*told.world.bodies, twin))
+    with pytest.raises(ValueError, match="box and twin start 0 mm apart"):
+        world.check()
+    lost = dataclasses.replace(told.world.tags[0], position_m=(9.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="leaves the room"):
+        dataclasses.replace(told.world, tags=(lost,)).check()
+    with pytest.raises(ValueError, match="A world of 0 steps"):
+        dataclasses.replace(told.world, num_steps=0).check()
+
+
 def test_impossible_films_are_refused():
     filmed = _tell("tabletop", 1.0)
     with pytest.raises(ValueError, match="500 frames asked for; the world lasts for 6"):

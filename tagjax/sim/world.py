@@ -13,6 +13,9 @@ import numpy as np
 STEP_S = 0.01
 """Sampling of every motion: frames and reads fall on, or are interpolated between, these times."""
 
+MIN_APART_M = 0.01
+"""Two objects whose middles are nearer to each other than this at the start are in one place."""
+
 Texture = Literal["plain", "noise", "checker", "stripes", "speckle", "photo"]
 ShapeKind = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid"]
 Role = Literal["room", "furniture", "person", "object"]
@@ -114,7 +117,10 @@ class World:
     note: str = ""
 
     def check(self) -> None:
-        """Raise `ValueError` for a world that cannot be: no step, a tag without a body or outside the room."""
+        """Raise `ValueError` for a world that cannot be.
+
+        No step, a tag without a body or outside the room, two objects that start in one place.
+        """
         if self.num_steps < 1:
             raise ValueError(f"A world of {self.num_steps} steps; at least 1 is needed.")
         for body in self.bodies:
@@ -123,6 +129,15 @@ class World:
                 raise ValueError(f"Body {body.name}: {rows} poses; expected 1 or {self.num_steps}.")
             if not np.all(np.isfinite(body.poses.position_m)):
                 raise ValueError(f"Body {body.name}: a position is not finite.")
+        objects = [body for body in self.bodies if body.role == "object"]
+        for number, one in enumerate(objects):
+            for other in objects[:number]:
+                apart = float(np.linalg.norm(one.poses.position_m[0] - other.poses.position_m[0]))
+                if apart < MIN_APART_M:
+                    raise ValueError(
+                        f"{other.name} and {one.name} start {apart * 1e3:.0f} mm apart; objects need "
+                        f"{MIN_APART_M * 1e3:.0f} mm between their middles. Place one elsewhere."
+                    )
         for tag in self.tags:
             if not 0 <= tag.body < len(self.bodies):
                 raise ValueError(f"Tag {tag.epc}: body {tag.body}; there are {len(self.bodies)}.")
