@@ -17,7 +17,7 @@ import pytest
 import synthetic_clips as synthetic
 import zarr
 
-from tagjax.data import flow_cache
+from tagjax.data import flow_cache, store
 from tagjax.data.clips import clip_dataset, load_clip
 from tagjax.data.flow_cache import pair_flow
 from tagjax.data.store import StoredFrames, open_recording, save_recording, write_recording
@@ -581,7 +581,7 @@ def test_an_interrupted_flow_leaves_the_recording_usable(moving, monkeypatch, st
 
 _KILLED = """
 import os, signal, sys
-from tagjax.data import flow_cache
+from tagjax.data import flow_cache, store
 from tagjax.data.store import open_recording
 
 def slow(name):
@@ -689,3 +689,21 @@ def test_the_clip_stream_is_shuffled_by_seed_and_resumes_exactly(recording):
     assert [next(fresh).start for _ in range(3)] == later
     with pytest.raises(RecordingError, match="the longest has 12"):
         clip_dataset([recording], clip_length=40, stride=4, seed=0)
+
+
+def test_two_processes_that_write_one_recording_leave_one_of_them(tmp_path, monkeypatch):
+    """The second to finish is told so in words, and what the first wrote stays."""
+    path = tmp_path / "a.zarr"
+    write, calls = store.write_recording, []
+
+    def overtaken(recording, root, **settings):
+        write(recording, root, **settings)
+        if not calls:
+            calls.append(1)
+            save_recording(recording, path)
+
+    monkeypatch.setattr(store, "write_recording", overtaken)
+    with pytest.raises(RecordingError, match="another process wrote it meanwhile"):
+        save_recording(synthetic.recording(3), path)
+    assert open_recording(path).num_frames == 3
+    assert [item.name for item in tmp_path.iterdir()] == ["a.zarr"]

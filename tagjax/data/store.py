@@ -104,7 +104,12 @@ def save_recording(recording: Recording, path: str | Path, *, progress: bool = F
     try:
         root = zarr.open_group(str(partial), mode="w", zarr_format=3)
         write_recording(recording, root, progress=progress)
-        os.replace(partial, path)
+        try:
+            os.replace(partial, path)
+        except OSError as error:
+            if not path.exists():
+                raise
+            raise RecordingError(f"{path} exists by now: another process wrote it meanwhile. Use that one.") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
