@@ -10,6 +10,7 @@ import pytest
 
 from tagjax.recording import Recording
 from tagjax.rf.coherence import coherence, phase_residual
+from tagjax.sim.objects import bounds
 from tagjax.sim.record import CaptureSettings, film
 from tagjax.sim.stories import STORIES, tell
 from tagjax.sim.world import STEP_S, rotation_matrix, tag_path
@@ -98,6 +99,27 @@ def test_a_handed_over_object_goes_from_one_to_the_other_without_a_jump():
     away = [np.linalg.norm(np.mean(parts, axis=0)[:, :2] - path[:, :2], axis=1) for parts in people.values()]
     assert away[0][0] < away[1][0]
     assert away[1][-1] < away[0][-1]
+
+
+def test_what_is_put_down_stays_and_the_hand_goes():
+    filmed = _tell("put_down", 6.0)
+    path = _object(filmed, 0).poses.position_m
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / STEP_S
+    assert speed[:340].max() > 0.5
+    assert speed.max() < 4.0
+    np.testing.assert_array_equal(path[-1], path[380])
+    stand = next(body for body in filmed.world.bodies if body.name == "stand")
+    # It stands on the stand: bottom on top.
+    bottom = path[-1, 2] - make_object_half_height(filmed)
+    assert bottom == pytest.approx(2 * stand.shapes[0].size_m[2], abs=1e-6)
+    hands = [body.poses.position_m for body in filmed.world.bodies if body.role == "person"]
+    nearest = np.min([np.linalg.norm(hand - path, axis=1) for hand in hands], axis=0)
+    assert nearest[-1] > nearest[330] + 0.1
+
+
+def make_object_half_height(filmed) -> float:
+    low, high = bounds(_object(filmed, 0).shapes)
+    return float(high[2] - low[2]) / 2
 
 
 def test_the_notebook_hides_the_object_and_lets_it_be_seen_again():

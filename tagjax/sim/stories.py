@@ -15,7 +15,7 @@ import numpy as np
 
 from ._rotation import quaternion_of
 from .inventory import InventorySettings
-from .motion import Walk, num_steps, path_through, random_walks, still_then_move, walk_along, wave
+from .motion import Walk, num_steps, path_through, random_walks, smooth_step, still_then_move, walk_along, wave
 from .objects import ObjectModel, make_object
 from .people import Hands, PersonModel, carried, hold, make_person, move_person, person_bodies
 from .record import Filmed
@@ -388,6 +388,41 @@ def handover(
     return stage.filmed("an object is handed over", look_at_m=(place[0], 0.8 * place[1], 1.1))
 
 
+def put_down(
+    rng: np.random.Generator,
+    duration_s: float,
+    *,
+    room: str = "meeting_room",
+    kind: str = "bottle",
+    speed_m_s: float = 1.0,
+) -> Filmed:
+    """A person waves an object, puts it down on a stand, and takes the hand away: it stays there."""
+    stage = _Set(make_room(room, rng), duration_s)
+    (place,) = _holders(stage.room, rng, 1, (1.9, 2.5))
+    camera = stage.room.camera_position_m
+    walk = _standing(place, float(np.arctan2(camera[1] - place[1], camera[0] - place[0])), stage.steps)
+    time_s = np.arange(stage.steps) * STEP_S
+    down_s = 0.6 * duration_s
+    waved = _waved(walk, -1, rng, duration_s, speed_m_s, 0.5)
+    spot, aside = hold(walk, (0.42, -0.3, 0.95)), hold(walk, (0.12, -0.34, 0.85))
+    # Down to the spot, a moment of rest there, then back to the side.
+    lower = smooth_step(np.clip((time_s - down_s + 0.8) / 0.8, 0, 1))[:, None]
+    leave = smooth_step(np.clip((time_s - down_s - 0.2) / 0.6, 0, 1))[:, None]
+    hands = Hands(right=(1 - leave) * ((1 - lower) * waved + lower * spot) + leave * aside)
+    person, model = make_person(rng), make_object(kind, rng)
+    stage.person(person, walk, hands)
+    held = carried(move_person(person, walk, hands).right_hand, model.grip_m)
+    release = min(int(np.ceil((down_s + 0.1) / STEP_S)), stage.steps - 1)
+    index = np.minimum(np.arange(stage.steps), release)
+    stage.object(model, Poses(held.position_m[index], held.quaternion[index]))
+    x, y, z = held.position_m[release]
+    top = z - model.half_size_m[2]
+    wood = Material((0.45, 0.32, 0.2), "stripes", 25.0, 0.25, transmission_db=2.0)
+    stand = Shape("box", (0.16, 0.16, float(top) / 2), wood)
+    stage.bodies.append(Body("stand", (stand,), Poses.fixed((x, y, top / 2)), "furniture"))
+    return stage.filmed("an object is put down", look_at_m=(place[0], 0.8 * place[1], 1.0))
+
+
 def tabletop(
     rng: np.random.Generator,
     duration_s: float,
@@ -542,6 +577,7 @@ STORIES: Mapping[str, Callable[..., Filmed]] = {
     "approach": approach,
     "crowd": crowd,
     "handover": handover,
+    "put_down": put_down,
     "tabletop": tabletop,
     "shop_exit": shop_exit,
     "grid": grid,
