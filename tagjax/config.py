@@ -48,6 +48,11 @@ class ClipSettings:
         if self.length < self.window:
             raise ConfigError(f"length is {self.length}; expected at least the window's {self.window} frames.")
 
+    def arguments(self) -> dict[str, Any]:
+        """What `load_clip` and `clip_dataset` both take, by name."""
+        names = ("stride", "flow", "window", "max_reads", "estimator", "antenna")
+        return {name: getattr(self, name) for name in names}
+
 
 @dataclasses.dataclass(frozen=True)
 class SimulateSettings:

@@ -110,14 +110,14 @@ def test_what_is_put_down_stays_and_the_hand_goes():
     np.testing.assert_array_equal(path[-1], path[380])
     stand = next(body for body in filmed.world.bodies if body.name == "stand")
     # It stands on the stand: bottom on top.
-    bottom = path[-1, 2] - make_object_half_height(filmed)
+    bottom = path[-1, 2] - _half_height(filmed)
     assert bottom == pytest.approx(2 * stand.shapes[0].size_m[2], abs=1e-6)
     hands = [body.poses.position_m for body in filmed.world.bodies if body.role == "person"]
     nearest = np.min([np.linalg.norm(hand - path, axis=1) for hand in hands], axis=0)
     assert nearest[-1] > nearest[330] + 0.1
 
 
-def make_object_half_height(filmed) -> float:
+def _half_height(filmed) -> float:
     low, high = bounds(_object(filmed, 0).shapes)
     return float(high[2] - low[2]) / 2
 

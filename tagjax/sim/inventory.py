@@ -25,13 +25,13 @@ from .reader import (
     ROUND_JITTER,
     ROUND_PER_TAG_S,
     RSSI_AT_1M_DBM,
-    RSSI_STEP_DB,
     SENSITIVITY_DBM,
     ReaderSettings,
     ReaderState,
     channel_at,
     noise_sigma_rad,
     quantise_phase,
+    quantise_rssi,
 )
 from .virtual_tag import Track
 
@@ -267,7 +267,7 @@ def simulate_inventory(
         antenna=(antenna + 1).astype(np.int16),
         carrier_hz=carrier,
         phase_rad=quantise_phase(settings.phase_sign * noisy),
-        rssi_dbm=(np.rint(measured / RSSI_STEP_DB) * RSSI_STEP_DB).astype(np.float32),
+        rssi_dbm=quantise_rssi(measured),
         doppler_hz=doppler.astype(np.float32),
         reader_time_ns=reader_ns,
         channel_index=(index + 1).astype(np.int16),

@@ -26,6 +26,7 @@ __all__ = [
     "carried",
     "hand_path",
     "hold",
+    "limb_bodies",
     "make_person",
     "move_person",
     "person_bodies",
@@ -114,7 +115,11 @@ def person_bodies(
 
     `walk` is sampled every `STEP_S`; `hands` has targets of the same length. Raises `ValueError` where it has not.
     """
-    motion = move_person(model, walk, hands)
+    return limb_bodies(model, move_person(model, walk, hands), label=label, name=name)
+
+
+def limb_bodies(model: PersonModel, motion: PersonMotion, *, label: int = 0, name: str = "person") -> tuple[Body, ...]:
+    """The limbs of a person whose motion is known already: see `person_bodies`."""
     shapes = limb_shapes(model)
     return tuple(Body(name, shapes[limb], poses, "person", label) for limb, poses in motion.limbs.items())
 

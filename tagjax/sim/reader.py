@@ -136,6 +136,11 @@ def noise_sigma_rad(rssi_dbm: np.ndarray, floor_rad: float) -> np.ndarray:
     return np.hypot(floor_rad, 10.0 ** (NOISE_SLOPE_PER_DBM * rssi_dbm + NOISE_INTERCEPT))
 
 
+def quantise_rssi(rssi_dbm: np.ndarray) -> np.ndarray:
+    """RSSI as reported, float32 dBm: in steps of `RSSI_STEP_DB`."""
+    return (np.rint(rssi_dbm / RSSI_STEP_DB) * RSSI_STEP_DB).astype(np.float32)
+
+
 def quantise_phase(phase_rad: np.ndarray) -> np.ndarray:
     """Phase as reported: modulo 2 pi, in steps of `CODE_STEP` codes."""
     step = 2 * np.pi * CODE_STEP / CODES_PER_TURN

@@ -13,24 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from ._rotation import quaternion_of
+from ._crowd import is_free
+from ._rotation import quaternion_of, turn_about
 from .inventory import InventorySettings
 from .motion import Walk, num_steps, path_through, random_walks, smooth_step, still_then_move, walk_along, wave
 from .objects import ObjectModel, make_object
-from .people import Hands, PersonModel, carried, hold, make_person, move_person, person_bodies
+from .people import Hands, PersonModel, PersonMotion, carried, hold, limb_bodies, make_person, move_person
 from .record import Filmed
 from .rooms import Room, make_room
+from .virtual_tag import default_epc
 from .world import STEP_S, Body, Material, Poses, Shape, Tag, World, rotation_matrix
 
 KINDS = ("bottle", "box", "toy", "notebook", "bag")
 """The five objects of the single-object experiments."""
 
+_UP = (0.0, 0.0, 1.0)
 _HAND_M = (0.36, 0.27, 1.12)  # where a hand is held before the body: ahead, to the side, above the floor
-
-
-def epc_of(number: int) -> str:
-    """A 96-bit EPC that ends in a number."""
-    return f"E28011{number:018X}"
 
 
 class _Set:
@@ -42,9 +40,12 @@ class _Set:
         self.tags: list[Tag] = []
         self.names: dict[int, str] = {}
 
-    def person(self, model: PersonModel, walk: Walk, hands: Hands) -> None:
+    def person(self, model: PersonModel, walk: Walk, hands: Hands) -> PersonMotion:
+        """Put a person on a walk; what comes back says where the hands really are."""
         number = len({body.name for body in self.bodies if body.role == "person"})
-        self.bodies += person_bodies(model, walk, hands, name=f"person {number + 1}")
+        motion = move_person(model, walk, hands)
+        self.bodies += limb_bodies(model, motion, name=f"person {number + 1}")
+        return motion
 
     def object(self, model: ObjectModel, poses: Poses, *, tagged: bool = True, labelled: bool = True) -> None:
         label = len(self.names) + 1 if labelled else 0
@@ -52,7 +53,7 @@ class _Set:
             self.names[label] = model.name
         self.bodies.append(Body(model.name, model.shapes, poses, "object", label))
         if tagged:
-            self.tags.append(Tag(epc_of(len(self.tags) + 1), len(self.bodies) - 1, model.tag_m, model.dipole))
+            self.tags.append(Tag(default_epc(len(self.tags) + 1), len(self.bodies) - 1, model.tag_m, model.dipole))
 
     def inside(self, path_m: np.ndarray) -> np.ndarray:
         """A hand's path kept off the walls: who walks along a wall does not reach through it."""
@@ -93,10 +94,15 @@ def _standing(place: tuple[float, float], heading_rad: float, steps: int) -> Wal
     return walk_along(np.broadcast_to(np.array(place), (steps, 2)), heading_rad)
 
 
+def _facing(place: Sequence[float], other: Sequence[float]) -> float:
+    """Heading from a place on the floor towards another, radians."""
+    return float(np.arctan2(other[1] - place[1], other[0] - place[0]))
+
+
 def _resting(model: ObjectModel, place: Sequence[float], yaw_rad: float = 0.0) -> Poses:
     """An object that stands at a place: x, y, and the height of what is below it."""
     x, y, z = place
-    return Poses.fixed((x, y, z + model.half_size_m[2]), (np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)))
+    return Poses.fixed((x, y, z + model.half_size_m[2]), turn_about(_UP, yaw_rad))
 
 
 def _waved(
@@ -112,6 +118,11 @@ def _waved(
     path = wave("random", (0.0, 0.0, 0.0), moving, peak_speed_m_s=speed_m_s, max_acceleration_m_s2=push, rng=rng)
     offsets = still_then_move(path, still_s, duration_s)
     return start + _fit(offsets, len(start))
+
+
+def _ease(share: np.ndarray) -> np.ndarray:
+    """0 to 1 with the first derivative zero at both ends; gentler in the middle than `smooth_step`."""
+    return share * share * (3 - 2 * share)
 
 
 def _fit(path: np.ndarray, steps: int) -> np.ndarray:
@@ -135,13 +146,9 @@ def _holders(
 
 
 def _clear(room: Room, place: tuple[float, float]) -> bool:
+    """Whether somebody can stand there: as walkers, or up to 0.2 m nearer to the camera."""
     x0, y0, x1, y1 = room.walk_area_m
-    if not (x0 - 0.2 <= place[0] <= x1 and y0 <= place[1] <= y1):
-        return False
-    return all(
-        np.hypot(max(a - place[0], place[0] - c, 0), max(b - place[1], place[1] - d, 0)) > 0.35
-        for a, b, c, d in room.obstacles_m
-    )
+    return is_free(np.asarray(place), (x0 - 0.2, y0, x1, y1), room.obstacles_m, 0.35)
 
 
 def handheld(
@@ -176,7 +183,7 @@ def handheld(
     places = _holders(stage.room, rng, count, (distance_m[0], distance_m[1]))
     camera = stage.room.camera_position_m
     for number, place in enumerate(places):
-        facing = float(np.arctan2(camera[1] - place[1], camera[0] - place[0])) + float(rng.uniform(-0.2, 0.2))
+        facing = _facing(place, camera) + float(rng.uniform(-0.2, 0.2))
         walk = _standing(place, facing, stage.steps)
         mine = models if one_grip else models[2 * number : 2 * number + 2]
         right = _waved(walk, -1, rng, duration_s, speed_m_s, still_s)
@@ -184,8 +191,7 @@ def handheld(
         if passing:
             left = _before(walk, right, camera, duration_s)
         person, hands = make_person(rng), Hands(left=left, right=right)
-        stage.person(person, walk, hands)
-        motion = move_person(person, walk, hands)
+        motion = stage.person(person, walk, hands)
         if one_grip:
             _together(stage, mine, motion.right_hand)
         else:
@@ -219,7 +225,7 @@ def _before(walk: Walk, object_m: np.ndarray, camera_m: Sequence[float], duratio
     aside = hold(walk, (0.3, 0.45, 1.0))
     begin = 0.55 * duration_s
     share = np.clip(np.minimum((time_s - begin) / 0.5, (begin + 2.0 - time_s) / 0.5), 0, 1)
-    share = (share * share * (3 - 2 * share))[:, None]
+    share = (_ease(share))[:, None]
     return (1 - share) * aside + share * cover
 
 
@@ -297,8 +303,8 @@ def approach(
     walk = _trimmed(walk_along(path), stage.steps)
     person, model = make_person(rng), make_object(kind, rng)
     hands = Hands(right=hold(walk, (0.25, -0.3, 1.0)))
-    stage.person(person, walk, hands)
-    stage.object(model, carried(move_person(person, walk, hands).right_hand, model.grip_m))
+    motion = stage.person(person, walk, hands)
+    stage.object(model, carried(motion.right_hand, model.grip_m))
     return stage.filmed(f"a person walks to and fro at {speed_m_s} m/s", look_at_m=((near + far) / 2, 0.5 * y, 0.95))
 
 
@@ -332,8 +338,7 @@ def crowd(
         swing = [stage.inside(_waved(walk, side, rng, duration_s, 0.5, 0.0)) for side in (-1, 1)]
         hands = Hands(right=swing[0], left=swing[1] if objects_each == 2 else None)
         person = make_person(rng)
-        stage.person(person, walk, hands)
-        motion = move_person(person, walk, hands)
+        motion = stage.person(person, walk, hands)
         for hand in (motion.right_hand, motion.left_hand)[:objects_each]:
             model = make_object(str(rng.choice(KINDS)), rng)
             stage.object(model, carried(hand, model.grip_m))
@@ -368,18 +373,16 @@ def handover(
     meeting = np.array([*(0.5 * (spots[0] + spots[1]) + 0.3 * toward), 1.15])
     away = [_waved(walk, side, rng, duration_s, speed_m_s, 0.5) for walk, side in zip(walks, (1, -1), strict=True)]
     near = np.clip(1.25 * (1 - np.abs(time_s - meet_s) / 0.9), 0, 1)
-    near = (near * near * (3 - 2 * near))[:, None]
+    near = (_ease(near))[:, None]
     targets = [(1 - near) * path + near * meeting for path in away]
     people = [make_person(rng), make_person(rng)]
     hands = [Hands(left=targets[0]), Hands(right=targets[1])]
-    motions = [move_person(person, walk, hand) for person, walk, hand in zip(people, walks, hands, strict=True)]
-    for person, walk, hand in zip(people, walks, hands, strict=True):
-        stage.person(person, walk, hand)
+    motions = [stage.person(person, walk, hand) for person, walk, hand in zip(people, walks, hands, strict=True)]
     model = make_object(kind, rng)
     giver, taker = carried(motions[0].left_hand, model.grip_m), carried(motions[1].right_hand, model.grip_m)
     # Both hands are at the meeting point for a moment; the object goes over within it.
     share = np.clip((time_s - meet_s) / 0.2 + 0.5, 0, 1)[:, None]
-    share = share * share * (3 - 2 * share)
+    share = _ease(share)
     turn = (1 - share) * giver.quaternion + share * taker.quaternion * np.sign(
         np.sum(giver.quaternion * taker.quaternion, axis=1, keepdims=True) + 1e-12
     )
@@ -400,7 +403,7 @@ def put_down(
     stage = _Set(make_room(room, rng), duration_s)
     (place,) = _holders(stage.room, rng, 1, (1.9, 2.5))
     camera = stage.room.camera_position_m
-    walk = _standing(place, float(np.arctan2(camera[1] - place[1], camera[0] - place[0])), stage.steps)
+    walk = _standing(place, _facing(place, camera), stage.steps)
     time_s = np.arange(stage.steps) * STEP_S
     down_s = 0.6 * duration_s
     waved = _waved(walk, -1, rng, duration_s, speed_m_s, 0.5)
@@ -410,8 +413,7 @@ def put_down(
     leave = smooth_step(np.clip((time_s - down_s - 0.2) / 0.6, 0, 1))[:, None]
     hands = Hands(right=(1 - leave) * ((1 - lower) * waved + lower * spot) + leave * aside)
     person, model = make_person(rng), make_object(kind, rng)
-    stage.person(person, walk, hands)
-    held = carried(move_person(person, walk, hands).right_hand, model.grip_m)
+    held = carried(stage.person(person, walk, hands).right_hand, model.grip_m)
     release = min(int(np.ceil((down_s + 0.1) / STEP_S)), stage.steps - 1)
     index = np.minimum(np.arange(stage.steps), release)
     stage.object(model, Poses(held.position_m[index], held.quaternion[index]))
@@ -454,9 +456,7 @@ def tabletop(
         velocity = np.gradient(line, axis=0)
         yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
         z = np.full(stage.steps, table.height_m + model.half_size_m[2])
-        nothing = np.zeros_like(yaw)
-        turn = np.stack([np.cos(yaw / 2), nothing, nothing, np.sin(yaw / 2)], axis=-1)
-        stage.object(model, Poses(np.column_stack([line, z]), turn))
+        stage.object(model, Poses(np.column_stack([line, z]), turn_about(_UP, yaw)))
     roof = Material((0.35, 0.3, 0.28), "speckle", 30.0, 0.3, transmission_db=1.0)
     for number in range(num_tunnels):
         line = lines[number % len(lines)]
@@ -533,8 +533,7 @@ def shop_exit(
         hands = Hands(
             right=hold(walk, (0.2, -0.28, 0.95)), left=hold(walk, (0.2, 0.28, 0.95)) if tags_each > 1 else None
         )
-        stage.person(person, walk, hands)
-        motion = move_person(person, walk, hands)
+        motion = stage.person(person, walk, hands)
         for number in range(tags_each):
             model = make_object(str(rng.choice(["bag", "box", "bottle", "toy"])), rng, scale=0.8)
             hand = (motion.right_hand, motion.left_hand)[number % 2]
@@ -564,7 +563,7 @@ def grid(
         path += [(x, y)] * pause
         if number + 1 < len(points):
             share = np.linspace(0, 1, 51)[1:-1, None]
-            smooth = share * share * (3 - 2 * share)
+            smooth = _ease(share)
             path += list((1 - smooth) * np.array([x, y]) + smooth * np.array(points[number + 1]))
     line = _fit(np.array(path), stage.steps)
     place = np.column_stack([line, np.full(stage.steps, height_m)])

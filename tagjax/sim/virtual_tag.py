@@ -14,13 +14,13 @@ from .._numerics import SPEED_OF_LIGHT_M_S
 from ..recording import Recording, RecordingError, TagReads, Truth
 from .reader import (
     DOPPLER_STD_HZ,
-    RSSI_STEP_DB,
     SENSITIVITY_DBM,
     ReaderSettings,
     ReaderState,
     channel_at,
     noise_sigma_rad,
     quantise_phase,
+    quantise_rssi,
     read_times,
     rssi_at,
 )
@@ -129,7 +129,7 @@ def virtual_reads(
         antenna=np.ones(count, np.int16),
         carrier_hz=carrier,
         phase_rad=quantise_phase(phase),
-        rssi_dbm=(np.rint(rssi / RSSI_STEP_DB) * RSSI_STEP_DB).astype(np.float32),
+        rssi_dbm=quantise_rssi(rssi),
         doppler_hz=(-2 * speed * carrier / SPEED_OF_LIGHT_M_S + rng.normal(0, DOPPLER_STD_HZ, count)).astype(
             np.float32
         ),

@@ -53,14 +53,9 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
         clip_dataset(
             training,
             clip_length=clips.length,
-            stride=clips.stride,
-            epcs=clips.epcs,
-            flow=clips.flow,
-            window=clips.window,
-            max_reads=clips.max_reads,
-            estimator=clips.estimator,
-            antenna=clips.antenna,
             seed=config.seed,
+            epcs=clips.epcs,
+            **clips.arguments(),
         )
     )
     held_out = [clip for recording in validation for clip in validation_clips(recording, clips)]

@@ -24,13 +24,8 @@ def clip_loader(settings: ClipSettings) -> Callable[..., Clip]:
             recording,
             start,
             stop,
-            stride=settings.stride,
             epcs=settings.epcs if epcs is None else epcs,
-            flow=settings.flow,
-            window=settings.window,
-            max_reads=settings.max_reads,
-            estimator=settings.estimator,
-            antenna=settings.antenna,
+            **settings.arguments(),
         )
 
     return load
