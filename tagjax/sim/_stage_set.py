@@ -1,0 +1,181 @@
+"""What stories share: a world in the making, places to stand, hands that wave, people and things around."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ._crowd import is_free
+from ._rotation import turn_about
+from .inventory import InventorySettings
+from .motion import Walk, num_steps, random_walks, still_then_move, walk_along, wave
+from .objects import ObjectModel, make_object
+from .people import Hands, PersonModel, PersonMotion, hold, limb_bodies, make_person, move_person
+from .record import Filmed
+from .rooms import Room
+from .virtual_tag import default_epc
+from .world import Body, Poses, Tag, World
+
+UP = (0.0, 0.0, 1.0)
+
+HAND_M = (0.36, 0.27, 1.12)  # where a hand is held before the body: ahead, to the side, above the floor
+
+
+class StageSet:
+    """Bodies, tags and labels of a world in the making."""
+
+    def __init__(self, room: Room, duration_s: float):
+        self.room, self.steps = room, num_steps(duration_s)
+        self.bodies: list[Body] = list(room.bodies)
+        self.tags: list[Tag] = []
+        self.names: dict[int, str] = {}
+
+    def person(self, model: PersonModel, walk: Walk, hands: Hands) -> PersonMotion:
+        """Put a person on a walk; what comes back says where the hands really are."""
+        number = len({body.name for body in self.bodies if body.role == "person"})
+        motion = move_person(model, walk, hands)
+        self.bodies += limb_bodies(model, motion, name=f"person {number + 1}")
+        return motion
+
+    def object(self, model: ObjectModel, poses: Poses, *, tagged: bool = True, labelled: bool = True) -> None:
+        label = len(self.names) + 1 if labelled else 0
+        if labelled:
+            self.names[label] = model.name
+        self.bodies.append(Body(model.name, model.shapes, poses, "object", label))
+        if tagged:
+            self.tags.append(Tag(default_epc(len(self.tags) + 1), len(self.bodies) - 1, model.tag_m, model.dipole))
+
+    def inside(self, path_m: np.ndarray) -> np.ndarray:
+        """A hand's path kept off the walls: who walks along a wall does not reach through it."""
+        length, width, _ = self.room.size_m
+        low, high = np.array([0.0, 0.3 - width / 2, 0.0]), np.array([length - 0.3, width / 2 - 0.3, np.inf])
+        return np.clip(path_m, low, high)
+
+    def filmed(
+        self, note: str, *, look_at_m: Sequence[float] | None = None, num_antennas: int = 1, **inventory: Any
+    ) -> Filmed:
+        room = self.room
+        if not 1 <= num_antennas <= len(room.antennas_m):
+            raise ValueError(
+                f"{num_antennas} antennas asked for; the {room.name} has places for {len(room.antennas_m)}."
+            )
+        world = World(
+            bodies=tuple(self.bodies),
+            tags=tuple(self.tags),
+            num_steps=self.steps,
+            size_m=room.size_m,
+            lights=room.lights,
+            ambient=room.ambient,
+            names=self.names,
+            note=note,
+        )
+        x, y, z = room.camera_look_at_m if look_at_m is None else look_at_m
+        return Filmed(
+            world,
+            room.camera_position_m,
+            (float(x), float(y), float(z)),
+            room.antennas_m[:num_antennas],
+            room.panels,
+            InventorySettings(**inventory),
+        )
+
+
+def standing(place: tuple[float, float], heading_rad: float, steps: int) -> Walk:
+    """A walk that never leaves its place (x, y)."""
+    return walk_along(np.broadcast_to(np.array(place), (steps, 2)), heading_rad)
+
+
+def facing_towards(place: Sequence[float], other: Sequence[float]) -> float:
+    """Heading from a place on the floor towards another, radians."""
+    return float(np.arctan2(other[1] - place[1], other[0] - place[0]))
+
+
+def resting(model: ObjectModel, place: Sequence[float], yaw_rad: float = 0.0) -> Poses:
+    """An object that stands at a place: x, y, and the height of what is below it."""
+    x, y, z = place
+    return Poses.fixed((x, y, z + model.half_size_m[2]), turn_about(UP, yaw_rad))
+
+
+def waved_hand(
+    walk: Walk, side: int, rng: np.random.Generator, duration_s: float, speed_m_s: float, still_s: float
+) -> np.ndarray:
+    """World path of a hand that is still before the body, then waves at random with the given peak speed."""
+    offset = (HAND_M[0], side * HAND_M[1], HAND_M[2] + float(rng.uniform(-0.05, 0.1)))
+    start = hold(walk, offset)
+    still_s = min(still_s, 0.4 * duration_s)
+    moving = duration_s - still_s
+    # An arm that stays in front of the body reaches about 0.3 m around; faster waves need harder pushes.
+    push = max(12.0, 5.5 * speed_m_s**2)
+    path = wave("random", (0.0, 0.0, 0.0), moving, peak_speed_m_s=speed_m_s, max_acceleration_m_s2=push, rng=rng)
+    offsets = still_then_move(path, still_s, duration_s)
+    return start + fitted(offsets, len(start))
+
+
+def ease(share: np.ndarray) -> np.ndarray:
+    """0 to 1 with the first derivative zero at both ends; gentler in the middle than `smooth_step`."""
+    return share * share * (3 - 2 * share)
+
+
+def fitted(path: np.ndarray, steps: int) -> np.ndarray:
+    """The path cut, or its end held, to a number of steps."""
+    return path[np.minimum(np.arange(steps), len(path) - 1)]
+
+
+def standing_places(
+    room: Room, rng: np.random.Generator, count: int, distance_m: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Places (x, y) beside each other before the camera, clear of furniture."""
+    camera = np.array(room.camera_position_m[:2])
+    for _ in range(2000):
+        away = rng.uniform(*distance_m)
+        gap = 1.15
+        middle = rng.uniform(-0.4, 0.4)
+        places = [(camera[0] + away, camera[1] + middle + gap * (k - (count - 1) / 2)) for k in range(count)]
+        if all(is_clear(room, place) for place in places):
+            return places
+    raise ValueError(f"No place for {count} people {distance_m} m before the camera of the {room.name}.")
+
+
+def is_clear(room: Room, place: tuple[float, float]) -> bool:
+    """Whether somebody can stand there: as walkers, or up to 0.2 m nearer to the camera."""
+    x0, y0, x1, y1 = room.walk_area_m
+    return is_free(np.asarray(place), (x0 - 0.2, y0, x1, y1), room.obstacles_m, 0.35)
+
+
+def add_walkers(
+    stage: StageSet, rng: np.random.Generator, count: int, duration_s: float, taken: Sequence[tuple[float, float]]
+) -> None:
+    """People with empty hands who walk behind those who stand."""
+    if not count:
+        return
+    room = stage.room
+    x0, y0, x1, y1 = room.walk_area_m
+    behind = max((place[0] for place in taken), default=x0) + 0.7
+    walks = random_walks(
+        count, duration_s, rng, area_m=(min(behind, x1 - 1.2), y0, x1, y1), obstacles_m=room.obstacles_m
+    )
+    for walk in walks:
+        stage.person(make_person(rng), trimmed(walk, stage.steps), Hands())
+
+
+def trimmed(walk: Walk, steps: int) -> Walk:
+    """The walk cut, or its end held, to a number of steps."""
+    index = np.minimum(np.arange(steps), len(walk.heading_rad) - 1)
+    return Walk(*(getattr(walk, field.name)[index] for field in dataclasses.fields(walk)))
+
+
+def add_still_tags(stage: StageSet, rng: np.random.Generator, count: int) -> None:
+    """Small tagged things that lie on tables, shelves and the floor; they are not labelled."""
+    tables = stage.room.tables
+    for _ in range(count):
+        model = make_object(str(rng.choice(["book", "mug", "box"])), rng, scale=0.8)
+        if tables and rng.random() < 0.8:
+            table = tables[int(rng.integers(len(tables)))]
+            x0, y0, x1, y1 = table.top_m
+            place = (rng.uniform(x0 + 0.05, x1 - 0.05), rng.uniform(y0 + 0.05, y1 - 0.05), table.height_m)
+        else:
+            place = (*stage.room.free_place(rng), 0.0)
+        stage.object(model, resting(model, place, rng.uniform(0, 2 * np.pi)), labelled=False)

@@ -1,0 +1,102 @@
+"""Stories of things that move over a table."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ._rotation import turn_about
+from ._stage_set import (
+    UP,
+    StageSet,
+    fitted,
+)
+from .motion import path_through
+from .objects import make_object
+from .record import Filmed
+from .rooms import make_room
+from .world import STEP_S, Body, Material, Poses, Shape
+
+
+def tabletop(
+    rng: np.random.Generator,
+    duration_s: float,
+    *,
+    num_objects: int = 4,
+    kind: str = "train",
+    speed_m_s: Sequence[float] = (0.25, 0.5),
+    tracks: str = "loops",
+    num_tunnels: int = 0,
+    spacing_m: float = 0.164,
+    antenna: str = "ceiling",
+) -> Filmed:
+    """Toy trains on a table top of 1.5 x 3 m, seen from the ceiling.
+
+    `tracks`: "loops" (rounded closed tracks, one each), "parallel" (straight lines `spacing_m` apart, the same motion),
+    "curves" (open curves over the table). Trains disappear under `num_tunnels` for a while. `antenna`: "ceiling"
+    beside the camera, or "side", at the table's edge and height.
+    """
+    if tracks not in ("loops", "parallel", "curves"):
+        raise ValueError(f"tracks is {tracks!r}; expected loops, parallel or curves.")
+    if antenna not in ("ceiling", "side"):
+        raise ValueError(f"antenna is {antenna!r}; expected ceiling or side.")
+    stage = StageSet(make_room("ceiling_view", rng), duration_s)
+    table = stage.room.tables[0]
+    time_s = np.arange(stage.steps) * STEP_S
+    lines = _track_lines(tracks, num_objects, table.top_m, time_s, rng, (speed_m_s[0], speed_m_s[1]), spacing_m)
+    for line in lines:
+        model = make_object(kind, rng)
+        velocity = np.gradient(line, axis=0)
+        yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
+        z = np.full(stage.steps, table.height_m + model.half_size_m[2])
+        stage.object(model, Poses(np.column_stack([line, z]), turn_about(UP, yaw)))
+    roof = Material((0.35, 0.3, 0.28), "speckle", 30.0, 0.3, transmission_db=1.0)
+    for number in range(num_tunnels):
+        line = lines[number % len(lines)]
+        x, y = line[int(rng.uniform(0.3, 0.7) * len(line))]
+        size = (0.14, 0.16, 0.006)
+        shape = Shape("box", size, roof)
+        stage.bodies.append(Body("tunnel", (shape,), Poses.fixed((x, y, table.height_m + 0.2)), "furniture"))
+    filmed = stage.filmed(f"{num_objects} trains on {tracks}")
+    if antenna == "side":
+        place = (table.top_m[2] + 0.4, float(rng.uniform(-0.4, 0.4)), table.height_m + 0.1)
+        filmed = dataclasses.replace(filmed, antennas_m=(place,))
+    return filmed
+
+
+def _track_lines(kind, count, top_m, time_s, rng, speed_m_s, spacing_m) -> list[np.ndarray]:
+    """Paths (steps, 2) on the table top."""
+    x0, y0, x1, y1 = top_m
+    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+    lines = []
+    if kind == "parallel":
+        pace = rng.uniform(*speed_m_s)
+        swing = 0.5 * (y1 - y0) - 0.25
+        along = swing * np.sin(pace / swing * time_s + rng.uniform(-0.5, 0.5))
+        for number in range(count):
+            across = (number - (count - 1) / 2) * spacing_m
+            lines.append(np.stack([np.full_like(along, middle[0] + across), middle[1] + along], axis=-1))
+        return lines
+    for number in range(count):
+        if kind == "loops":
+            # Tracks beside each other along the table, each with its own oval.
+            span = (y1 - y0) / count
+            centre = np.array([middle[0], y0 + span * (number + 0.5)])
+            radius = np.array([rng.uniform(0.3, 0.55), span / 2 - 0.13])
+            if min(radius) < 0.08:
+                raise ValueError(f"{count} loops do not fit a table of {y1 - y0:.1f} m; ask for fewer.")
+            turn = rng.choice([-1, 1]) * rng.uniform(*speed_m_s) / np.mean(radius)
+            angle = rng.uniform(0, 2 * np.pi) + turn * time_s
+            lines.append(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+        else:
+            low, high = np.array([x0 + 0.15, y0 + 0.15]), np.array([x1 - 0.15, y1 - 0.15])
+            points = [np.array([*rng.uniform(low, high), 0.0])]
+            while len(points) < 12:
+                point = np.array([*rng.uniform(low, high), 0.0])
+                if np.linalg.norm(point - points[-1]) > 0.5:
+                    points.append(point)
+            path = path_through(points, speed_m_s=rng.uniform(*speed_m_s), max_acceleration_m_s2=1.0)[:, :2]
+            lines.append(np.clip(fitted(path, len(time_s)), low - 0.1, high + 0.1))
+    return lines
