@@ -208,8 +208,7 @@ def _run(folder: Path, num_steps: int, *, interrupt_at: int | None = None):
         return train(
             state,
             clips,
-            optimizer=optimizer,
-            objective=SETTINGS,
+            update=lambda state, clips: train_step(state, clips, optimizer, SETTINGS),
             settings=LoopSettings(num_steps, batch_size=2, checkpoint_every=3, progress=False),
             logger=logger,
             checkpoints=checkpoints,

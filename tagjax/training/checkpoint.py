@@ -1,6 +1,6 @@
 """Checkpoints: everything a run needs to go on exactly where it stopped, written atomically by Orbax.
 
-A checkpoint holds the arrays of the `TrainState` (never code or pickles), the state of the data iterator and a
+A checkpoint holds the arrays of the training state (never code or pickles), the state of the data iterator and a
 description of the arrays, which is compared before anything is restored.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,7 +17,9 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
-from .state import TrainState
+from .state import Stepped
+
+StateT = TypeVar("StateT", bound=Stepped)
 
 FORMAT = "tagjax training checkpoint 1"
 
@@ -62,7 +64,7 @@ class Checkpoints:
         """Steps at which a finished checkpoint exists, ascending."""
         return sorted(self._manager.all_steps())
 
-    def save(self, state: TrainState, data_state: Any) -> None:
+    def save(self, state: Stepped, data_state: Any) -> None:
         """Write a checkpoint of the state at its step; `data_state` is plain JSON (the iterator's own state)."""
         step = int(state.step)
         if step in self.steps():
@@ -79,11 +81,11 @@ class Checkpoints:
         )
         self._manager.wait_until_finished()
 
-    def restore(self, like: TrainState, step: int | None = None) -> tuple[TrainState, Any]:
+    def restore(self, like: StateT, step: int | None = None) -> tuple[StateT, Any]:
         """The state at `step` (the newest if None) and the data iterator's state.
 
         `like` is a fresh state of the same configuration: it gives the structure, the checkpoint the arrays. A folder
-        without checkpoint, a foreign or damaged one, or one of another tracer raises `CheckpointError`.
+        without checkpoint, a foreign or damaged one, or one of another model raises `CheckpointError`.
         """
         steps = self.steps()
         if not steps:
@@ -144,7 +146,7 @@ def _compare(found: dict[str, str], expected: dict[str, str], path: Path) -> Non
     if differences:
         listed = "; ".join(differences[:5]) + (f"; and {len(differences) - 5} more" if len(differences) > 5 else "")
         raise CheckpointError(
-            f"The checkpoint {path} belongs to another tracer or optimiser. {listed}. Use the configuration of its run."
+            f"The checkpoint {path} belongs to another model or optimiser. {listed}. Use the configuration of its run."
         )
 
 

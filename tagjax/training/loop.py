@@ -1,30 +1,29 @@
-"""The training loop: plain Python around `train_step`, with progress, logs, checkpoints and a clean way out."""
+"""The training loop: plain Python around one update, with progress, logs, checkpoints and a clean way out."""
 
 from __future__ import annotations
 
 import dataclasses
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import jax
-import optax
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .checkpoint import Checkpoints
 from .logging import Logger
-from .loss import ObjectiveSettings
-from .state import TrainState
-from .step import ClipLike, train_step
+from .state import Stepped
+
+StateT = TypeVar("StateT", bound=Stepped)
 
 
 @runtime_checkable
-class ClipIterator(Protocol):
-    """An endless source of clips whose place can be kept: what Grain's iterators are."""
+class DataIterator(Protocol):
+    """An endless source of samples whose place can be kept: what Grain's iterators are."""
 
-    def __next__(self) -> ClipLike: ...
+    def __next__(self) -> Any: ...
 
     def get_state(self) -> Any: ...
 
@@ -36,7 +35,7 @@ class LoopSettings:
     """How long, and how often what is written."""
 
     num_steps: int = 14
-    batch_size: int = 1  # clips whose gradients are averaged in a step
+    batch_size: int = 1  # samples whose gradients are averaged in a step
     checkpoint_every: int = 7
     validate_every: int = 7
     log_every: int = 1
@@ -44,10 +43,10 @@ class LoopSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Trained:
+class Trained(Generic[StateT]):
     """How a call of `train` ended."""
 
-    state: TrainState
+    state: StateT
     interrupted: bool
 
 
@@ -72,20 +71,21 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def train(
-    state: TrainState,
-    clips: ClipIterator,
+    state: StateT,
+    samples: DataIterator,
     *,
-    optimizer: optax.GradientTransformation,
-    objective: ObjectiveSettings,
+    update: Callable[[StateT, Sequence[Any]], tuple[StateT, dict[str, float]]],
     settings: LoopSettings,
     logger: Logger,
     checkpoints: Checkpoints,
-    validate: Callable[[TrainState], Mapping[str, float]] | None = None,
-    after_step: Callable[[TrainState], None] | None = None,
-) -> Trained:
+    validate: Callable[[StateT], Mapping[str, float]] | None = None,
+    after_step: Callable[[StateT], None] | None = None,
+    shown: Sequence[str] = ("loss", "own_coherence"),
+) -> Trained[StateT]:
     """Train from `state.step` to `num_steps`; a checkpoint is written at the end whatever ends it.
 
-    `validate` gives numbers that are logged under `validation/`; `after_step` is called after every step.
+    `update` does one step on `batch_size` samples and gives numbers to log; `shown` names those beside the progress
+    bar. `validate` gives numbers that are logged under `validation/`; `after_step` is called after every step.
     """
     columns = (
         TextColumn("[bold]train"),
@@ -100,8 +100,7 @@ def train(
     with _stop_on_interrupt() as stop_asked, Progress(*columns, disable=not settings.progress) as progress:
         task = progress.add_task("train", total=settings.num_steps, completed=done, numbers="compiling")
         while done < settings.num_steps and not stop_asked():
-            batch = [next(clips) for _ in range(settings.batch_size)]
-            state, numbers = train_step(state, batch, optimizer, objective)
+            state, numbers = update(state, [next(samples) for _ in range(settings.batch_size)])
             done += 1
             if done % settings.log_every == 0 or done == settings.num_steps:
                 logger.write(done, numbers)
@@ -109,12 +108,12 @@ def train(
                 found = {f"validation/{name}": value for name, value in validate(state).items()}
                 logger.write(done, found)
             if done % settings.checkpoint_every == 0 or done == settings.num_steps:
-                checkpoints.save(state, clips.get_state())
+                checkpoints.save(state, samples.get_state())
             if after_step is not None:
                 after_step(state)
-            shown = "  ".join(f"{name} {numbers[name]:.3f}" for name in ("loss", "own_coherence") if name in numbers)
-            progress.update(task, completed=done, numbers=shown)
+            told = "  ".join(f"{name} {numbers[name]:.3f}" for name in shown if name in numbers)
+            progress.update(task, completed=done, numbers=told)
         if stop_asked():
             jax.block_until_ready(state.step)
-            checkpoints.save(state, clips.get_state())
+            checkpoints.save(state, samples.get_state())
     return Trained(state, done < settings.num_steps)

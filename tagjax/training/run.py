@@ -23,7 +23,7 @@ from .logging import Logger
 from .loop import train
 from .sources import clip_loader, training_recordings
 from .state import TrainState
-from .step import clip_loss, make_optimizer
+from .step import clip_loss, make_optimizer, train_step
 
 VALIDATION_CLIPS = 2
 
@@ -75,8 +75,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
             trained = train(
                 state,
                 source,
-                optimizer=optimizer,
-                objective=config.objective,
+                update=lambda state, clips: train_step(state, clips, optimizer, config.objective),
                 settings=config.loop,
                 logger=logger,
                 checkpoints=checkpoints,

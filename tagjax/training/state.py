@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol, runtime_checkable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,14 @@ import optax
 from jaxtyping import Array, Int, PyTree, UInt32
 
 from ..tracer import AbstractTracer
+
+
+@runtime_checkable
+class Stepped(Protocol):
+    """Any training state: it knows how many steps were done."""
+
+    @property
+    def step(self) -> Int[Array, ""]: ...
 
 
 class TrainState(eqx.Module):
