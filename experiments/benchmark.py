@@ -1,6 +1,7 @@
 """Measure the stages against named peers in the same run; the last line printed is the result as JSON.
 
 python -m experiments.benchmark
+python -m experiments.benchmark flow
 python -m experiments.benchmark 'cases=[gather,splat]' repeats=21
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
 import hydra
@@ -29,11 +31,12 @@ def main(config: DictConfig) -> None:
     settings = from_mapping(BenchmarkSettings, resolved(config))
     with console.status("measuring") as status:
         timings = run_benchmark(settings, on_case=lambda name: status.update(f"measuring {name}"))
-    table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s")
+    table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s", "memory, MiB")
     for timing in timings:
         first = f"{timing.compile_s:.1f}" if timing.compile_s else ""
+        memory = f"{timing.memory_mib:.0f}" if timing.memory_mib else ""
         row = (timing.what, f"{timing.ours_ms:.2f}", timing.peer, f"{timing.peer_ms:.2f}", f"{timing.ratio:.2f}", first)
-        table.add_row(*row)
+        table.add_row(*row, memory)
     console.print(table)
     rows = [{**dataclasses.asdict(timing), "ratio": timing.ratio} for timing in timings]
     text = json.dumps({"machine": machine(), "timings": rows})
@@ -42,5 +45,13 @@ def main(config: DictConfig) -> None:
     print(text)
 
 
+def with_cases(arguments: list[str]) -> list[str]:
+    """Arguments for Hydra: bare words name the cases."""
+    names = [word for word in arguments if word.isidentifier()]
+    rest = [word for word in arguments if word not in names]
+    return [f"cases=[{','.join(names)}]", *rest] if names else rest
+
+
 if __name__ == "__main__":
+    sys.argv[1:] = with_cases(sys.argv[1:])
     main()

@@ -17,6 +17,8 @@ from typing import Any, Literal, TypeVar
 
 from .data.clips import check_clip
 from .evaluation.evaluate import ScoreSettings
+from .flow.losses import FlowLossSettings
+from .training.flow_sources import FlowDataSettings
 from .training.logging import LoggerSettings
 from .training.loop import LoopSettings
 from .training.loss import ObjectiveSettings
@@ -106,6 +108,28 @@ class TrainConfig:
     loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)
     logger: LoggerSettings = dataclasses.field(default_factory=LoggerSettings)
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainFlowConfig:
+    """Everything of a run that trains a flow network."""
+
+    flow: Mapping[str, Any]
+    optimizer: Mapping[str, Any]
+    init: str | None = None  # weights to begin with: `default` or a file; random ones if None
+    seed: int = 0
+    clip_norm: float = 1.0
+    average_over: int = 500  # steps that the kept weights are a running average of
+    matmul_precision: str | None = None  # of JAX: on GPUs `tensorfloat32` is its default, `bfloat16` faster
+    resume: bool = True
+    data: FlowDataSettings = dataclasses.field(default_factory=FlowDataSettings)
+    loss: FlowLossSettings = dataclasses.field(default_factory=FlowLossSettings)
+    loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)
+    logger: LoggerSettings = dataclasses.field(default_factory=LoggerSettings)
+
+    def __post_init__(self) -> None:
+        if self.average_over < 1:
+            raise ConfigError(f"average_over is {self.average_over}; expected at least 1 step.")
 
 
 @dataclasses.dataclass(frozen=True)

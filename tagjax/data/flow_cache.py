@@ -15,7 +15,8 @@ import zarr
 from rich.progress import track
 from zarr.storage import LocalStore
 
-from ..flow.opencv import FlowFunction, make_flow, to_gray
+from ..flow.named import flow_along, flow_key, make_flow
+from ..flow.opencv import FlowFunction
 from ..recording import Recording, RecordingError
 from .store import StoredFrames, create_array
 
@@ -32,22 +33,23 @@ _WAYS = ("forward", "backward")
 def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Flow between frames t - 1 and t for t = first .. last - 1: (forward on t - 1, backward on t).
 
-    Both float32 (frames, height, width, 2), pixels of the full picture; zero where there is no frame before. The flow
-    of the whole recording is computed on the first call and kept in half precision in its folder, under
-    `cache/flow/<method>/`, where that can be written; otherwise only the frames asked for are computed.
+    Both float32 (frames, height, width, 2), pixels of the full picture; zero where there is no frame before. `method`
+    is a flow that `make_flow` knows. The flow of the whole recording is computed on the first call and kept in half
+    precision in its folder, under `cache/flow/<key>/` (`flow_key`: other weights of a network have another), where that
+    can be written; otherwise only the frames asked for are computed.
     """
     if first < 0 or last > recording.num_frames or first >= last:
         raise ValueError(f"Frames {first} to {last} asked for; {recording.name} has {recording.num_frames}.")
-    flow = make_flow(method)
-    folder = _folder(recording, method)
+    key = flow_key(method)
+    folder = _folder(recording, key)
     if folder is None:
-        pairs = list(_pairs(recording, first, last, flow))
+        pairs = list(_pairs(recording, first, last, make_flow(method)))
         return np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
-    held = _read(recording, folder, method, first, last)
+    held = _read(recording, folder, key, first, last)
     if held is None:
         _clear(folder)
-        _fill(recording, folder, method, flow)
-        held = _read(recording, folder, method, first, last)
+        _fill(recording, folder, key, make_flow(method))
+        held = _read(recording, folder, key, first, last)
     if held is None:
         raise RecordingError(
             f"{folder}: the flow was written but cannot be read back. Remove the folder and look to the disk."
@@ -55,7 +57,7 @@ def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple
     return held
 
 
-def _folder(recording: Recording, method: str) -> Path | None:
+def _folder(recording: Recording, key: str) -> Path | None:
     """Where the flow of a recording is kept; None for a recording without a folder, or with other pictures in it."""
     root, colour = recording.store, recording.colour
     if not isinstance(root, zarr.Group) or not isinstance(root.store, LocalStore):
@@ -63,19 +65,19 @@ def _folder(recording: Recording, method: str) -> Path | None:
     # Pictures that were replaced after opening have a flow of their own.
     if not isinstance(colour, StoredFrames) or colour.array.store_path != root.store_path / "colour":
         return None
-    return Path(root.store.root) / root.path / _FOLDER / method
+    return Path(root.store.root) / root.path / _FOLDER / key
 
 
-def _told(recording: Recording, method: str) -> dict[str, Any]:
+def _told(recording: Recording, key: str) -> dict[str, Any]:
     """The attributes of a complete cache. They are written last, and a cache with others is none."""
-    return {"complete": True, "version": _VERSION, "method": method, "shape": [*recording.colour.shape[:3], 2]}
+    return {"complete": True, "version": _VERSION, "method": key, "shape": [*recording.colour.shape[:3], 2]}
 
 
-def _read(recording: Recording, folder: Path, method: str, first: int, last: int):
+def _read(recording: Recording, folder: Path, key: str, first: int, last: int):
     """The flow of some frames from the cache; None if there is none, or not all of it."""
     if not folder.is_dir():
         return None
-    told = _told(recording, method)
+    told = _told(recording, key)
     try:
         group = zarr.open_group(str(folder), mode="r", zarr_format=3)
         if dict(group.attrs) != told:
@@ -95,32 +97,28 @@ def _read(recording: Recording, folder: Path, method: str, first: int, last: int
 
 
 def _pairs(recording: Recording, first: int, last: int, flow: FlowFunction):
-    before = None
-    for t in range(max(first - 1, 0), last):
-        now = to_gray(np.asarray(recording.colour[t]))
-        if t == 0 and first == 0:
-            zero = np.zeros((*now.shape, 2), np.float32)
-            yield zero, zero
-        elif before is not None:
-            yield flow(before, now), flow(now, before)
-        before = now
+    start = max(first - 1, 0)
+    if first == 0:
+        zero = np.zeros((*recording.colour.shape[1:3], 2), np.float32)
+        yield zero, zero
+    yield from flow_along(flow, (np.asarray(recording.colour[t]) for t in range(start, last)))
 
 
-def _fill(recording: Recording, folder: Path, method: str, flow: FlowFunction) -> None:
+def _fill(recording: Recording, folder: Path, key: str, flow: FlowFunction) -> None:
     """Write the flow of every frame.
 
     Each process fills a folder of its own, which takes the cache's name when it is whole: whoever comes second finds
     the name taken and drops its own copy. A process that is killed leaves a partial folder that is never read.
     """
-    partial = folder.with_name(f".{method}.{uuid.uuid4().hex}.partial")
-    told = _told(recording, method)
+    partial = folder.with_name(f".{key}.{uuid.uuid4().hex}.partial")
+    told = _told(recording, key)
     shape = (*recording.colour.shape[:3], 2)
     try:
         group = zarr.open_group(str(partial), mode="w", zarr_format=3)
         targets = [create_array(group, way, shape, np.float16, per_frame=True) for way in _WAYS]
         pairs = _pairs(recording, 0, shape[0], flow)
         for t, pair in enumerate(
-            track(pairs, description=f"{recording.name}: {method} flow", total=shape[0], transient=True)
+            track(pairs, description=f"{recording.name}: {key} flow", total=shape[0], transient=True)
         ):
             for target, field in zip(targets, pair, strict=True):
                 target[t] = field.astype(np.float16)

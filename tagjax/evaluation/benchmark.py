@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..data.clips import load_clip
-from ..flow.opencv import make_flow
+from ..flow.named import make_flow
 from ..image.warp import gather, splat
 from ..rf.coherence import coherence
 from ..rf.windows import phase_reads, radio_windows
@@ -30,13 +30,15 @@ from ..sim.session import SceneSettings, simulate_recording
 from ..sim.stories import tell
 from ..tagattention import TagAttention
 from ..tracer import trace
+from .flow_speed import flow_timings
+from .timing import Timing, first_call_s, median_ms
 
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkSettings:
     """What is measured, and how long."""
 
-    cases: tuple[str, ...] = ("gather", "splat", "segment", "coherence", "radio", "step", "simulate", "pairs")
+    cases: tuple[str, ...] = ("gather", "splat", "segment", "coherence", "radio", "step", "simulate", "pairs", "flow")
     height: int = 424
     width: int = 512
     repeats: int = 7
@@ -48,39 +50,6 @@ class BenchmarkSettings:
             raise ValueError(f"Unknown benchmark {', '.join(unknown) or '(none)'}; there are {', '.join(CASES)}.")
         if self.height < 32 or self.width < 32 or self.repeats < 1:
             raise ValueError("A benchmark needs pictures of at least 32x32 pixels and 1 repetition.")
-
-
-@dataclasses.dataclass(frozen=True)
-class Timing:
-    """One measurement: ours and the peer's, milliseconds."""
-
-    what: str
-    ours_ms: float
-    peer: str
-    peer_ms: float
-    compile_s: float = 0.0
-
-    @property
-    def ratio(self) -> float:
-        """Ours over the peer's: below 1 is faster."""
-        return self.ours_ms / self.peer_ms
-
-
-def median_ms(function: Callable[[], Any], repeats: int) -> float:
-    """Median time of a call, milliseconds, after one call to warm up."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append((time.perf_counter() - start) * 1e3)
-    return float(np.median(times))
-
-
-def _first_call_s(function: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    jax.block_until_ready(function())
-    return time.perf_counter() - start
 
 
 def _warps(settings: BenchmarkSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +64,7 @@ def _gather(settings: BenchmarkSettings) -> Timing:
     x, y = np.meshgrid(np.arange(settings.width, dtype=np.float32), np.arange(settings.height, dtype=np.float32))
     run = jax.jit(gather)
     arguments = jnp.asarray(image), jnp.asarray(flow)
-    compile_s = _first_call_s(lambda: run(*arguments))
+    compile_s = first_call_s(lambda: run(*arguments))
     halves = image[..., :4].copy(), image[..., 4:].copy()  # cv2.remap takes at most four channels
 
     def peer():
@@ -112,7 +81,7 @@ def _splat(settings: BenchmarkSettings) -> Timing:
     height, width = settings.height, settings.width
     run = jax.jit(splat)
     arguments = jnp.asarray(image), jnp.asarray(flow)
-    compile_s = _first_call_s(lambda: run(*arguments))
+    compile_s = first_call_s(lambda: run(*arguments))
 
     def peer():
         x, y = np.meshgrid(np.arange(width), np.arange(height))
@@ -144,7 +113,7 @@ def _segment(settings: BenchmarkSettings) -> Timing:
     points = np.stack([x * depth, y * depth, depth], axis=-1).astype(np.float32)
     run = jax.jit(lambda p: segment(p, jnp.ones(p.shape[:2], bool), jnp.asarray(0.06), cell=8))
     given = jnp.asarray(points)
-    compile_s = _first_call_s(lambda: run(given))
+    compile_s = first_call_s(lambda: run(given))
     clusters = (height // 8) * (width // 8)
     stop = (cv2.TERM_CRITERIA_MAX_ITER, 3, 0.0)
     samples = points.reshape(-1, 3)
@@ -165,7 +134,7 @@ def _coherence(settings: BenchmarkSettings) -> Timing:
     channel = rng.integers(0, 16, (1, 64)).astype(np.int32)
     run = jax.jit(lambda r, w, c: coherence(r, w, c, num_channels=16))
     arguments = jnp.asarray(residual), jnp.asarray(weight), jnp.asarray(channel)
-    compile_s = _first_call_s(lambda: run(*arguments))
+    compile_s = first_call_s(lambda: run(*arguments))
     member = channel[0][:, None] == np.arange(16)
 
     def peer():
@@ -183,7 +152,7 @@ def _radio(settings: BenchmarkSettings) -> Timing:
     recording = _small_recording(settings)
     reads = phase_reads(recording.reads, recording.reads.epcs[0], int(recording.time_ns[0]))
     time_s = jnp.asarray(recording.frame_time_s(), jnp.float32)
-    compile_s = _first_call_s(lambda: radio_windows(reads, time_s, 5, "robust"))
+    compile_s = first_call_s(lambda: radio_windows(reads, time_s, 5, "robust"))
     ours = median_ms(lambda: radio_windows(reads, time_s, 5, "robust"), settings.repeats)
     peer = median_ms(lambda: radio_windows(reads, time_s, 5, "paper"), settings.repeats)
     return Timing(f"robust radio, {recording.num_frames} frames, one tag", ours, "paper's radio", peer, compile_s)
@@ -194,7 +163,7 @@ def _step(settings: BenchmarkSettings) -> Timing:
     clip = load_clip(recording, 0, recording.num_frames, stride=2)
     tracer = TagAttention()
     run = eqx.filter_jit(trace)
-    compile_s = _first_call_s(lambda: run(tracer, clip.camera, clip.frames).box_px)
+    compile_s = first_call_s(lambda: run(tracer, clip.camera, clip.frames).box_px)
     whole = median_ms(lambda: run(tracer, clip.camera, clip.frames).box_px, settings.repeats)
     rng = np.random.default_rng(settings.seed)
     picture = cv2.GaussianBlur((rng.uniform(size=(settings.height, settings.width)) * 255).astype(np.uint8), (0, 0), 3)
@@ -224,12 +193,16 @@ def _simulate(settings: BenchmarkSettings) -> Timing:
 def _pairs(settings: BenchmarkSettings) -> Timing:
     batch = 16
     draw = lambda seed: flow_pairs(FlowPairSettings(), batch, key=jax.random.key(seed)).first  # noqa: E731
-    compile_s = _first_call_s(lambda: draw(0))
+    compile_s = first_call_s(lambda: draw(0))
     ours = median_ms(lambda: draw(1), settings.repeats) / batch
     return Timing("flow pair, exact flow both ways", ours, "50 pairs/s", 20.0, compile_s)
 
 
-CASES: Mapping[str, Callable[[BenchmarkSettings], Timing]] = {
+def _flow(settings: BenchmarkSettings) -> list[Timing]:
+    return flow_timings(settings.height, settings.width, settings.repeats, settings.seed)
+
+
+CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing]]] = {
     "gather": _gather,
     "splat": _splat,
     "segment": _segment,
@@ -238,6 +211,7 @@ CASES: Mapping[str, Callable[[BenchmarkSettings], Timing]] = {
     "step": _step,
     "simulate": _simulate,
     "pairs": _pairs,
+    "flow": _flow,
 }
 """What can be measured, by name."""
 
@@ -258,9 +232,10 @@ def machine() -> dict[str, Any]:
 
 def run_benchmark(settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None) -> list[Timing]:
     """Measure every case; `on_case` is told the name of the one that begins."""
-    timings = []
+    timings: list[Timing] = []
     for name in settings.cases:
         if on_case is not None:
             on_case(name)
-        timings.append(CASES[name](settings))
+        found = CASES[name](settings)
+        timings += found if isinstance(found, list) else [found]
     return timings

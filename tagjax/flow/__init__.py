@@ -1,1 +1,1 @@
-"""Optical flow: named baselines. `tagjax.flow.opencv` imports cv2."""
+"""Optical flow: networks, losses, estimates, weights, and named flows. `opencv` and `named` import cv2."""

@@ -8,14 +8,22 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
+from .pictures import as_bytes, check_pictures
+
 FlowFunction: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(gray_from, gray_to), uint8 (height, width) each, to flow in pixels, float32 (height, width, 2) on `gray_from`."""
+"""(first, second), RGB uint8 (height, width, 3) each, to flow in pixels, float32 (height, width, 2) on `first`.
+
+Whatever else `check_pictures` takes is a picture, too.
+"""
 
 DIS_PRESETS = {
     "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
+
+_SMALLEST = 16
+"""Pixels of a side below which pictures are enlarged by repeating the edge: OpenCV's DIS refuses fewer than 12."""
 
 
 class DISFlow:
@@ -26,8 +34,10 @@ class DISFlow:
             raise ValueError(f"Unknown DIS preset {preset!r}; expected one of {', '.join(DIS_PRESETS)}.")
         self._dis = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
 
-    def __call__(self, gray_from: np.ndarray, gray_to: np.ndarray) -> np.ndarray:
-        return self._dis.calc(gray_from, gray_to, None)  # type: ignore[call-overload]
+    def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        one, other = _grey_pair(first, second)
+        flow = self._dis.calc(one, other, None)  # type: ignore[call-overload]
+        return flow[: np.shape(first)[0], : np.shape(first)[1]]
 
 
 class FarnebackFlow:
@@ -36,8 +46,10 @@ class FarnebackFlow:
     def __init__(self, levels: int = 4, window: int = 21, iterations: int = 3):
         self._settings = (0.5, levels, window, iterations, 7, 1.5, 0)
 
-    def __call__(self, gray_from: np.ndarray, gray_to: np.ndarray) -> np.ndarray:
-        return cv2.calcOpticalFlowFarneback(gray_from, gray_to, None, *self._settings)  # type: ignore[call-overload]
+    def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        one, other = _grey_pair(first, second)
+        flow = cv2.calcOpticalFlowFarneback(one, other, None, *self._settings)  # type: ignore[call-overload]
+        return flow[: np.shape(first)[0], : np.shape(first)[1]]
 
 
 FLOWS: dict[str, Callable[[], FlowFunction]] = {
@@ -49,7 +61,7 @@ FLOWS: dict[str, Callable[[], FlowFunction]] = {
 
 
 def make_flow(name: str) -> FlowFunction:
-    """A flow baseline by name; a name not in `FLOWS` raises `ValueError`."""
+    """A flow of OpenCV by name; a name not in `FLOWS` raises `ValueError`."""
     if name not in FLOWS:
         raise ValueError(f"Unknown optical flow {name!r}; expected one of {', '.join(FLOWS)}.")
     return FLOWS[name]()
@@ -58,3 +70,12 @@ def make_flow(name: str) -> FlowFunction:
 def to_gray(colour: np.ndarray) -> np.ndarray:
     """RGB uint8 (height, width, 3) to grey uint8."""
     return cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
+
+
+def _grey_pair(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both pictures, checked, in grey, and large enough."""
+    one, other = (to_gray(np.ascontiguousarray(as_bytes(picture))) for picture in check_pictures(first, second))
+    rows, columns = (max(0, _SMALLEST - size) for size in one.shape)
+    if rows or columns:
+        one, other = (np.pad(picture, ((0, rows), (0, columns)), mode="edge") for picture in (one, other))
+    return one, other

@@ -1,0 +1,44 @@
+"""Evaluate optical flows side by side: drawn pairs, recordings with exact flow, Middlebury's scenes, any video.
+
+python -m experiments.evaluate_flow 'flows=[zero,dis,pyramid]'
+python -m experiments.evaluate_flow 'flows=[dis,outputs/train_flow/<time>/weights.npz]' 'recordings=[a.zarr,b.zarr]'
+python -m experiments.evaluate_flow 'flows=[dis,pyramid]' num_pairs=0 'folders=[middlebury]' 'sequences=[my_video.mp4]'
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="evaluate_flow")
+def main(config: DictConfig) -> None:
+    from rich.console import Console
+
+    from tagjax.config import from_mapping
+    from tagjax.evaluation.flow import FlowEvaluationSettings, evaluate_flows, flow_tables
+    from tagjax.evaluation.report import plain
+
+    values = resolved(config)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+    console = Console()
+    try:
+        summary = evaluate_flows(from_mapping(FlowEvaluationSettings, values), folder)
+    except ValueError as error:
+        raise SystemExit(f"evaluate_flow: {error}") from error
+    for table in flow_tables(summary):
+        console.print(table)
+    console.print(f"report: {folder}", soft_wrap=True, highlight=False)
+    found = {name: {flow: s["all"] for flow, s in flows.items()} for name, flows in summary["materials"].items()}
+    print(json.dumps(plain(found), allow_nan=False))
+
+
+if __name__ == "__main__":
+    main()

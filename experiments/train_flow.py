@@ -1,0 +1,34 @@
+"""Train an optical-flow network without labels: on drawn pairs, recordings, videos and folders of pictures.
+
+python -m experiments.train_flow
+python -m experiments.train_flow init=default recipe=fine_tune 'data.sequences=[my_video.mp4]'
+python -m experiments.train_flow flow=raft_small loop.num_steps=50000
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train_flow")
+def main(config: DictConfig) -> float:
+    from tagjax.config import TrainFlowConfig, from_mapping
+    from tagjax.training.flow_run import run_flow_training
+
+    values = resolved(config)
+    checked = from_mapping(TrainFlowConfig, values)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+    score = run_flow_training(checked, folder)
+    print(f"run folder: {folder}")
+    return score
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""Pairs of neighbouring pictures for flow training: from recordings, videos, image folders, or drawn ones.
+
+Every source is a sequence of RGB pictures, read lazily; Grain draws, crops and varies them in worker threads, and its
+iterator resumes exactly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import grain
+import numpy as np
+import zarr
+from jaxtyping import UInt8
+from rich.progress import track
+
+from .._types import LazyArray
+from ..recording import RecordingError
+from .store import open_recording
+
+VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".webp")
+
+_LONGEST_SIDE = 640
+"""Videos are kept no larger: crops for training are far smaller."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VariationSettings:
+    """How a pair is cut from two pictures, and how what the network sees differs from what the loss compares.
+
+    The geometry is the same for both pictures of a pair; light and noise differ a little between them.
+    """
+
+    height: int = 128
+    width: int = 160
+    scale: tuple[float, float] = (0.7, 1.4)  # log-uniform; a picture too small is enlarged to fit
+    turn_deg: float = 10.0
+    gaps: tuple[int, ...] = (1, 2)  # frames between the pictures of a pair
+    gain: float = 0.25  # of both pictures
+    gamma: float = 0.25
+    tint: float = 0.1  # of each colour
+    unlike: float = 0.05  # gain between the two pictures
+    noise: float = 0.02
+    grey_share: float = 0.1  # pairs without colour
+
+    def __post_init__(self) -> None:
+        low, high = self.scale
+        if not 0 < low <= high:
+            raise ValueError(f"scale is {self.scale}; expected two positive numbers, the smaller first.")
+        if not self.gaps or min(self.gaps) < 1:
+            raise ValueError(f"gaps are {self.gaps}; expected frame distances of at least 1.")
+        if min(self.height, self.width) < 32:
+            raise ValueError(f"Crops of {self.height} x {self.width} are too small; use at least 32 x 32.")
+
+
+class ImageFolder:
+    """The pictures of a folder in order of their names, read when asked for."""
+
+    def __init__(self, folder: Path):
+        self._files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
+        if len(self._files) < 2:
+            raise RecordingError(
+                f"{folder} holds {len(self._files)} pictures ({', '.join(IMAGE_ENDINGS)}); a flow needs at least two."
+            )
+        self.shape = (len(self._files), *_read_picture(self._files[0]).shape)
+        self.dtype = np.dtype(np.uint8)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        picture = _read_picture(self._files[int(index)])
+        if picture.shape != self.shape[1:]:
+            raise RecordingError(
+                f"{self._files[int(index)]} has {picture.shape[1]} x {picture.shape[0]} pixels; the folder's first "
+                f"picture has {self.shape[2]} x {self.shape[1]}. Put pictures of one camera into one folder."
+            )
+        return picture
+
+
+def _read_picture(path: Path) -> np.ndarray:
+    """RGB uint8; grey pictures become RGB, 16 bits become 8."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise RecordingError(f"{path} cannot be read as a picture. Is it whole, and is its ending right?")
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def open_sequence(path: str, cache: Path) -> LazyArray:
+    """Pictures (frame, height, width, 3), uint8, of a recording (.zarr), a video file or a folder of pictures.
+
+    A video is decoded once, into `cache`. Raises `RecordingError` for anything else, and for fewer than two pictures.
+    """
+    where = Path(path)
+    if where.suffix == ".zarr" or path.startswith(("http://", "https://")):
+        sequence: LazyArray = open_recording(path).colour
+    elif where.is_dir():
+        sequence = ImageFolder(where)
+    elif where.suffix.lower() in VIDEO_ENDINGS and where.is_file():
+        sequence = _decoded(where, cache)
+    else:
+        found = "a file" if where.is_file() else "nothing"
+        raise RecordingError(
+            f"{path}: found {found}; expected a recording (.zarr), a folder of pictures ({', '.join(IMAGE_ENDINGS)}) "
+            f"or a video ({', '.join(VIDEO_ENDINGS)})."
+        )
+    if sequence.shape[0] < 2:
+        raise RecordingError(f"{path} holds {sequence.shape[0]} picture; a flow needs at least two.")
+    return sequence
+
+
+def _decoded(video: Path, cache: Path) -> LazyArray:
+    """The frames of a video, from the cache if it was decoded before."""
+    stamp = f"{video.resolve()} {video.stat().st_size} {video.stat().st_mtime_ns}"
+    target = cache / f"{video.stem}-{hashlib.sha256(stamp.encode()).hexdigest()[:12]}.zarr"
+    if not target.exists():
+        _decode(video, target)
+    return cast(LazyArray, zarr.open_array(str(target), mode="r"))
+
+
+def _decode(video: Path, target: Path) -> None:
+    capture = cv2.VideoCapture(str(video))
+    try:
+        ok, picture = capture.read()
+        if not ok:
+            raise RecordingError(f"{video} cannot be decoded. Is it whole, and does OpenCV know its codec?")
+        factor = min(1.0, _LONGEST_SIDE / max(picture.shape[:2]))
+        size = (round(picture.shape[1] * factor), round(picture.shape[0] * factor))
+        counted = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
+        try:
+            shape = (0, size[1], size[0], 3)
+            kept = zarr.create_array(str(partial), shape=shape, dtype="uint8", chunks=(1, *shape[1:]))
+            for _ in track(range(max(counted, 1)), description=f"decode {video.name}", transient=True):
+                small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
+                kept.append(np.ascontiguousarray(small)[None])
+                ok, picture = capture.read()
+                if not ok:
+                    break
+            os.replace(partial, target)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    finally:
+        capture.release()
+
+
+class PairSource:
+    """Every pair of pictures of a sequence that are one of `gaps` frames apart, as Grain's random access source."""
+
+    def __init__(self, sequence: LazyArray, gaps: Sequence[int]):
+        count = sequence.shape[0]
+        self._sequence = sequence
+        self._pairs = [(t, t + gap) for gap in gaps for t in range(count - gap)]
+        if not self._pairs:
+            raise RecordingError(f"No two of {count} pictures are {' or '.join(map(str, gaps))} frames apart.")
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index) -> UInt8[np.ndarray, "2 height width 3"]:
+        first, second = self._pairs[int(index)]
+        return np.stack([np.asarray(self._sequence[first]), np.asarray(self._sequence[second])])
+
+
+class StackedPairs:
+    """Pairs that already lie side by side, (pair, 2, height, width, 3), as Grain's random access source."""
+
+    def __init__(self, pairs: LazyArray):
+        self._pairs = pairs
+
+    def __len__(self) -> int:
+        return self._pairs.shape[0]
+
+    def __getitem__(self, index) -> UInt8[np.ndarray, "2 height width 3"]:
+        return np.asarray(self._pairs[int(index)])
+
+
+def vary(
+    pair: UInt8[np.ndarray, "2 _ _ 3"], rng: np.random.Generator, settings: VariationSettings
+) -> dict[str, UInt8[np.ndarray, "2 height width 3"]]:
+    """A random cut of a pair: `clean`, for the loss, and `seen`, for the network, with other light and noise."""
+    cut = _cut(pair, rng, settings)
+    seen = cut.astype(np.float32) / 255
+    seen = seen ** np.float32(np.exp(rng.uniform(-settings.gamma, settings.gamma)))
+    unlike = rng.uniform(-settings.unlike, settings.unlike, (2, 1, 1, 1))
+    tint = rng.uniform(-settings.tint, settings.tint, (1, 1, 1, 3))
+    seen = seen * (1 + rng.uniform(-settings.gain, settings.gain) + unlike + tint).astype(np.float32)
+    if rng.uniform() < settings.grey_share:
+        seen = np.repeat(np.mean(seen, axis=-1, keepdims=True), 3, axis=-1)
+    noise = rng.standard_normal(seen.shape, np.float32) * np.float32(settings.noise * rng.uniform() ** 2)
+    return {"clean": cut, "seen": np.clip(np.rint(255 * (seen + noise)), 0, 255).astype(np.uint8)}
+
+
+def _cut(pair: np.ndarray, rng: np.random.Generator, settings: VariationSettings) -> np.ndarray:
+    """Turn, scale, mirror and crop both pictures alike; either may come first."""
+    _, height, width, _ = pair.shape
+    low, high = settings.scale
+    scale = np.exp(rng.uniform(np.log(low), np.log(high)))
+    scale = max(scale, settings.height / height, settings.width / width)
+    turn = np.deg2rad(rng.uniform(-settings.turn_deg, settings.turn_deg))
+    # Where the cut's centre lies, such that without a turn all of it is in the picture.
+    room = np.array([width - settings.width / scale, height - settings.height / scale])
+    centre = np.array([(width - 1) / 2, (height - 1) / 2]) + (rng.uniform(size=2) - 0.5) * room
+    mirror = rng.choice([-1.0, 1.0], 2)
+    cosine, sine = np.cos(turn) / scale, np.sin(turn) / scale
+    linear = np.array([[cosine, -sine], [sine, cosine]]) * mirror
+    corner = centre - linear @ np.array([(settings.width - 1) / 2, (settings.height - 1) / 2])
+    matrix = np.concatenate([linear, corner[:, None]], axis=1)
+    # Shrinking skips pixels: blur first.
+    sigma = 0.5 * (1 / scale - 1)
+    order = rng.permutation(2)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    cuts = []
+    for picture in pair[order]:
+        smooth = cv2.GaussianBlur(picture, (0, 0), sigma) if sigma > 0.1 else np.ascontiguousarray(picture)
+        cuts.append(
+            cv2.warpAffine(
+                smooth, matrix, (settings.width, settings.height), flags=flags, borderMode=cv2.BORDER_REFLECT_101
+            )
+        )
+    return np.stack(cuts)
+
+
+class _Vary(grain.transforms.RandomMap):
+    def __init__(self, settings: VariationSettings):
+        self._settings = settings
+
+    def random_map(self, element: Any, rng: np.random.Generator) -> Any:
+        return vary(element, rng, self._settings)
+
+
+def pair_dataset(
+    sources: Sequence[PairSource | StackedPairs],
+    shares: Sequence[float],
+    settings: VariationSettings,
+    *,
+    seed: int,
+) -> grain.IterDataset:
+    """An endless, shuffled stream of varied pairs (`vary`), from each source by its share; its iterator resumes exactly."""
+    if len(sources) != len(shares) or not sources or min(shares) <= 0:
+        raise ValueError(f"{len(sources)} sources with shares {list(shares)}; expected a positive share for each.")
+    datasets = [
+        grain.MapDataset.source(source).seed(seed + number).shuffle().repeat().random_map(_Vary(settings))
+        for number, source in enumerate(sources)
+    ]
+    mixed = grain.MapDataset.mix(datasets, weights=list(shares)) if len(datasets) > 1 else datasets[0]
+    return mixed.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=16))

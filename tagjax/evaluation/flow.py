@@ -1,0 +1,249 @@
+"""Flows side by side on the same pairs: scores against truth and against the pictures, tables, and panels."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+from rich.box import SIMPLE
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ..flow.named import flow_key, make_flow
+from ..flow.opencv import FlowFunction
+from ..sim.flow_pairs import FlowPairSettings
+from ..viz.flow import flow_panel
+from .benchmark import machine
+from .flow_cases import FlowCase, Material, drawn_material, folder_material, recording_material, sequence_material
+from .flow_metrics import FlowScores, endpoint_error, warped_error
+from .report import write_json
+
+_COLUMNS = {
+    "epe_px": "EPE px",
+    "epe_visible_px": "visible",
+    "epe_hidden_px": "hidden",
+    "epe_moving_px": "moving",
+    "epe_still_px": "still",
+    "above_1px": "> 1 px %",
+    "above_3px": "> 3 px %",
+    "above_5px": "> 5 px %",
+    "fl": "Fl %",
+    "warped_levels": "warped",
+    "median_ms": "ms",
+}
+_SHARES = ("above_1px", "above_3px", "above_5px", "fl")
+_WORST_PX, _WORST_LEVELS = 3.0, 32.0
+"""Errors that panels show as white."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FlowEvaluationSettings:
+    """Which flows are compared, and on what."""
+
+    flows: tuple[str, ...] = ("zero", "dis_ultrafast", "dis_fast", "dis")
+    num_pairs: int = 64  # drawn ones; 0 for none
+    pair_seed: int = 2_000_003  # neither training nor validation draws from it
+    photographs: bool = False  # those of installed packages on drawn layers: other machines may have others
+    pairs: FlowPairSettings = dataclasses.field(default_factory=FlowPairSettings)
+    recordings: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()  # of Middlebury's kind
+    sequences: tuple[str, ...] = ()  # videos and folders of pictures, without truth
+    every: int = 5  # of recordings and sequences, every n-th picture and the next
+    most: int = 40  # pairs of one recording or sequence
+    moving_px: float = 0.5
+    num_panels: int = 4  # of each material
+    cache: str = "recordings"  # for decoded videos
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.flows:
+            raise ValueError("No flow is named; give flows=[dis,pyramid], for example.")
+        if self.num_pairs < 1 and not (self.recordings or self.folders or self.sequences):
+            raise ValueError(
+                "Nothing to evaluate on: num_pairs is 0, and no recordings, folders or sequences are named."
+            )
+        for name, least in (("num_pairs", 0), ("every", 1), ("most", 1), ("num_panels", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected at least {least}.")
+
+    def materials(self) -> list[Material]:
+        """Everything that flows are evaluated on. Raises `RecordingError` for what cannot be opened."""
+        found = []
+        if self.num_pairs:
+            photographs = None
+            if self.photographs:
+                from ..training.flow_sources import installed_photographs, photograph_stack
+
+                photographs = photograph_stack(installed_photographs(), self.pair_seed)
+            found.append(drawn_material(self.pairs, self.num_pairs, seed=self.pair_seed, photographs=photographs))
+        if self.recordings:
+            found.append(recording_material(self.recordings, every=self.every, most=self.most))
+        found += [folder_material(path) for path in self.folders]
+        if self.sequences:
+            found.append(sequence_material(self.sequences, Path(self.cache), every=self.every, most=self.most))
+        return found
+
+
+def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, Any]:
+    """Score every flow on every case; `folder` then holds metrics.json, flow.md and panels/.
+
+    The summary: of each material and flow the scores of all its pixels (`all`), those of each source, and the mean over
+    sources of their end-point errors. Raises `ValueError` for unknown flows, and what cannot be read.
+    """
+    names = _labels(settings.flows)
+    flows = {label: make_flow(name) for label, name in names.items()}
+    materials = settings.materials()
+    summary: dict[str, Any] = {
+        "flows": {label: flow_key(name) for label, name in names.items()},
+        "machine": machine(),
+        "materials": {},
+    }
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, disable=not settings.progress, transient=True) as bar:
+        for material in materials:
+            task = bar.add_task(material.name, total=material.num_cases)
+            scored = _Scored(flows, settings)
+            wanted = set(np.linspace(0, material.num_cases - 1, settings.num_panels).round().astype(int).tolist())
+            for number, case in enumerate(material.cases()):
+                scored.add(case, folder / "panels" if number in wanted else None)
+                bar.advance(task)
+            summary["materials"][material.name] = scored.result()
+    write_json(folder / "metrics.json", summary)
+    (folder / "flow.md").write_text(markdown(summary), encoding="utf-8")
+    return summary
+
+
+def _labels(names: Sequence[str]) -> dict[str, str]:
+    """Short names of flows: weights by the name of their file, or by the whole path where two share it."""
+    short = [Path(name).stem if name.endswith(".npz") else name for name in names]
+    return {stem if short.count(stem) == 1 else name: name for stem, name in zip(short, names, strict=True)}
+
+
+class _Scored:
+    """Scores of several flows on the cases of one material."""
+
+    def __init__(self, flows: Mapping[str, FlowFunction], settings: FlowEvaluationSettings):
+        self._flows, self._settings = flows, settings
+        self._scores: dict[str, dict[str, FlowScores]] = {name: {} for name in flows}
+        self._ms: dict[str, list[float]] = {name: [] for name in flows}
+        self._shapes: set[tuple[int, ...]] = set()
+
+    def add(self, case: FlowCase, panels: Path | None) -> None:
+        """Score all flows on a case, and draw them if there is a folder for it."""
+        predicted = {name: self._call(name, case) for name in self._flows}
+        self._shapes.add(case.first.shape)
+        for name, flow in predicted.items():
+            score = FlowScores.of_pictures(case.first, case.second, flow)
+            if case.truth_px is not None:
+                moving_px = self._settings.moving_px
+                score = score.merge(FlowScores.of_truth(flow, case.truth_px, case.occluded, moving_px=moving_px))
+            kept = self._scores[name]
+            kept[case.source] = kept.get(case.source, FlowScores()).merge(score)
+        if panels is not None:
+            panels.mkdir(parents=True, exist_ok=True)
+            name = re.sub(r"[^\w.-]+", "_", case.label)
+            cv2.imwrite(str(panels / f"{name}.png"), _panel(case, predicted)[..., ::-1])
+
+    def _call(self, name: str, case: FlowCase) -> np.ndarray:
+        start = time.perf_counter()
+        flow = np.asarray(jax.block_until_ready(self._flows[name](case.first, case.second)))
+        # What is compiled for a size is compiled in its first call.
+        if case.first.shape in self._shapes:
+            self._ms[name].append(1e3 * (time.perf_counter() - start))
+        return flow
+
+    def result(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name, sources in self._scores.items():
+            total = FlowScores()
+            for score in sources.values():
+                total = total.merge(score)
+            each = {source: score.result() for source, score in sources.items()}
+            errors = [scores["epe_px"] for scores in each.values() if scores.get("epe_px") is not None]
+            found[name] = {
+                "all": {**total.result(), "median_ms": float(np.median(self._ms[name])) if self._ms[name] else None},
+                "mean_epe_px": float(np.mean(np.asarray(errors, float))) if errors else None,
+                "sources": each,
+            }
+        return found
+
+
+def _panel(case: FlowCase, flows: Mapping[str, np.ndarray]) -> np.ndarray:
+    truth = case.truth_px
+    if truth is not None:
+        errors = {name: endpoint_error(flow, truth) for name, flow in flows.items()}
+    else:
+        parts = {name: warped_error(case.first, case.second, flow) for name, flow in flows.items()}
+        errors = {name: np.where(inside, error, np.nan) for name, (error, inside) in parts.items()}
+    unit, largest = ("px", _WORST_PX) if truth is not None else ("levels", _WORST_LEVELS)
+    return flow_panel(case.first, case.second, truth, flows, errors, largest_error=largest, unit=unit)
+
+
+def _rows(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows of one material's scores; columns that nothing is known of are left out."""
+    shown = [key for key in _COLUMNS if any(flow["all"].get(key) is not None for flow in found.values())]
+    rows = [[name, *(_text(key, flow["all"].get(key)) for key in shown)] for name, flow in found.items()]
+    return ["flow", *(_COLUMNS[key] for key in shown)], rows
+
+
+def _source_rows(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]] | None:
+    """Headings and rows of end-point errors by source; None for a single one, or without truth."""
+    sources = list(next(iter(found.values()))["sources"])
+    if not 2 <= len(sources) <= 8 or all(flow["mean_epe_px"] is None for flow in found.values()):
+        return None
+    rows = [
+        [
+            name,
+            *(_text("epe_px", flow["sources"][source].get("epe_px")) for source in sources),
+            _text("epe_px", flow["mean_epe_px"]),
+        ]
+        for name, flow in found.items()
+    ]
+    return ["EPE px", *sources, "mean"], rows
+
+
+def _text(key: str, value: float | None) -> str:
+    if value is None:
+        return "-"
+    if key in _SHARES:
+        return f"{100 * value:.1f}"
+    return f"{value:.1f}" if key in ("warped_levels", "median_ms") else f"{value:.3f}"
+
+
+def _tables(summary: Mapping[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
+    tables = []
+    for material, found in summary["materials"].items():
+        tables.append((material, *_rows(found)))
+        if (by_source := _source_rows(found)) is not None:
+            tables.append((f"{material}, each", *by_source))
+    return tables
+
+
+def flow_tables(summary: Mapping[str, Any]) -> list[Table]:
+    """The scores as tables for a terminal, one or two a material."""
+    drawn = []
+    for title, headings, rows in _tables(summary):
+        table = Table(title=title, box=SIMPLE, pad_edge=False)
+        for number, heading in enumerate(headings):
+            widest = max(len(heading), *(len(row[number]) for row in rows))
+            table.add_column(heading, justify="right" if number else "left", no_wrap=True, min_width=widest)
+        for row in rows:
+            table.add_row(*row)
+        drawn.append(table)
+    return drawn
+
+
+def markdown(summary: Mapping[str, Any]) -> str:
+    """The same tables as Markdown."""
+    parts = []
+    for title, headings, rows in _tables(summary):
+        lines = [headings, ["---", *["---:"] * (len(headings) - 1)], *rows]
+        parts.append(f"**{title}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n")
+    return "\n".join(parts)

@@ -1,0 +1,143 @@
+"""Pairs of pictures that flows are evaluated on: drawn ones, recordings, folders of Middlebury's kind, and videos."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Shaped, UInt8
+
+from ..data.flo import read_flo
+from ..data.picture_pairs import open_sequence
+from ..data.store import open_recording
+from ..flow.pictures import check_pictures
+from ..recording import RecordingError
+from ..sim.flow_pairs import FlowPairSettings, flow_pairs
+
+_BATCH = 8
+_NAMES = ("frame10.png", "frame11.png", "flow10.flo")
+"""Middlebury's: first picture, second picture, flow from the first to the second."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FlowCase:
+    """Two pictures, uint8 or floats from 0 to 1, and what is known of the flow from the first to the second."""
+
+    source: str  # scene, recording or video that it is from
+    label: str
+    first: Shaped[np.ndarray, "height width 3"]
+    second: Shaped[np.ndarray, "height width 3"]
+    truth_px: Float[np.ndarray, "height width 2"] | None = None  # NaN where it is unknown
+    occluded: Bool[np.ndarray, "height width"] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """A number of cases, made one after the other when they are asked for."""
+
+    name: str
+    num_cases: int
+    cases: Callable[[], Iterator[FlowCase]]
+
+
+def drawn_material(
+    settings: FlowPairSettings,
+    num_pairs: int,
+    *,
+    seed: int,
+    photographs: UInt8[np.ndarray, "count rows columns 3"] | None = None,
+) -> Material:
+    """Drawn pairs with exact flow."""
+
+    def cases() -> Iterator[FlowCase]:
+        for start in range(0, num_pairs, _BATCH):
+            # Whole batches, so that all pairs come from one compiled function and are the same for any number.
+            key = jax.random.fold_in(jax.random.key(seed), start)
+            drawn = jax.tree.map(np.asarray, flow_pairs(settings, _BATCH, photographs, key=key))
+            for n in range(min(_BATCH, num_pairs - start)):
+                first, second = (np.rint(255 * image[n]).astype(np.uint8) for image in (drawn.first, drawn.second))
+                label = f"drawn-{start + n:03d}"
+                yield FlowCase("drawn", label, first, second, drawn.forward_px[n], drawn.occluded_first[n])
+
+    return Material("drawn pairs", num_pairs, cases)
+
+
+def recording_material(paths: tuple[str, ...], *, every: int, most: int) -> Material:
+    """Every `every`-th frame and the next of recordings, `most` of each; with their exact flow where they hold it."""
+    recordings = [open_recording(path) for path in paths]
+    names = _told_apart([recording.name for recording in recordings])
+    frames = [_chosen(recording.num_frames, every, most, recording.name) for recording in recordings]
+
+    def cases() -> Iterator[FlowCase]:
+        for name, recording, chosen in zip(names, recordings, frames, strict=True):
+            truth = recording.truth
+            for t in chosen:
+                first, second = (np.asarray(recording.colour[k]) for k in (t, t + 1))
+                flow = hidden = None
+                if truth is not None and truth.flow_px is not None:
+                    flow = np.asarray(truth.flow_px[t], np.float32)
+                    hidden = None if truth.occluded is None else np.asarray(truth.occluded[t], bool)
+                yield FlowCase(name, f"{name}-{t:04d}", first, second, flow, hidden)
+
+    return Material("recordings", sum(map(len, frames)), cases)
+
+
+def folder_material(path: str) -> Material:
+    """Scenes of a folder, each a folder with frame10.png, frame11.png and, where it is known, flow10.flo.
+
+    The folder may be a scene itself. Raises `RecordingError` where there is no scene.
+    """
+    root = Path(path)
+    scenes = [root] if (root / _NAMES[0]).is_file() else sorted(p.parent for p in root.glob(f"*/{_NAMES[0]}"))
+    if not scenes:
+        raise RecordingError(
+            f"{path}: no {_NAMES[0]}, here or in folders within; expected scenes as Middlebury has them."
+        )
+
+    def cases() -> Iterator[FlowCase]:
+        for scene in scenes:
+            first, second = (_picture(scene / name) for name in _NAMES[:2])
+            truth = read_flo(scene / _NAMES[2]) if (scene / _NAMES[2]).is_file() else None
+            if truth is not None and truth.shape[:2] != first.shape[:2]:
+                raise RecordingError(f"{scene}: a flow of {truth.shape[:2]} pixels for a picture of {first.shape[:2]}.")
+            yield FlowCase(scene.name, scene.name, first, second, truth)
+
+    return Material(root.name, len(scenes), cases)
+
+
+def sequence_material(paths: tuple[str, ...], cache: Path, *, every: int, most: int) -> Material:
+    """Every `every`-th picture and the next of videos and folders of pictures, `most` of each; without truth."""
+    names = _told_apart([Path(path).stem for path in paths])
+    sequences = [(name, open_sequence(path, cache)) for name, path in zip(names, paths, strict=True)]
+    frames = [_chosen(sequence.shape[0], every, most, name) for name, sequence in sequences]
+
+    def cases() -> Iterator[FlowCase]:
+        for (name, sequence), chosen in zip(sequences, frames, strict=True):
+            for t in chosen:
+                yield FlowCase(name, f"{name}-{t:04d}", np.asarray(sequence[t]), np.asarray(sequence[t + 1]))
+
+    return Material("without truth", sum(map(len, frames)), cases)
+
+
+def _told_apart(names: Sequence[str]) -> list[str]:
+    """The names, numbered where several are alike."""
+    return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names)]
+
+
+def _chosen(count: int, every: int, most: int, name: str) -> range:
+    if count < 2:
+        raise RecordingError(f"{name} holds {count} picture; a flow needs at least two.")
+    return range(0, count - 1, every)[:most]
+
+
+def _picture(path: Path) -> np.ndarray:
+    """RGB; 16 bits become floats from 0 to 1."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if picture is None:
+        raise RecordingError(f"{path} is missing or cannot be read as a picture.")
+    picture = np.ascontiguousarray(picture[..., ::-1])
+    return picture if picture.dtype == np.uint8 else check_pictures(picture, picture)[0]

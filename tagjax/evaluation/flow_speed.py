@@ -1,0 +1,118 @@
+"""Speed and memory of the default flow network beside OpenCV's DIS, and of a step of its training."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+import optax
+
+from ..flow.estimate import NetworkFlow
+from ..flow.losses import FlowLossSettings
+from ..flow.named import flow_along, make_flow
+from ..flow.pyramid import PyramidFlow
+from ..training.flow_step import FlowTrainState, flow_step
+from .timing import Timing, first_call_s, medians_ms
+
+_BATCH, _ROWS, _COLUMNS = 8, 128, 160
+"""Pairs of a training step, and their size."""
+
+_AVERAGE_OVER = 500.0
+_DIS = {"dis": "DIS medium", "dis_fast": "DIS fast", "dis_ultrafast": "DIS ultrafast"}
+
+
+def moved_pictures(height: int, width: int, count: int, seed: int) -> list[np.ndarray]:
+    """RGB pictures of a texture that a smooth flow of some pixels moves on from one to the next."""
+    rng = np.random.default_rng(seed)
+    margin = 24
+    grain = rng.uniform(0, 255, (height + 2 * margin, width + 2 * margin, 3)).astype(np.float32)
+    scene = np.sum([2 * sigma * cv2.GaussianBlur(grain, (0, 0), sigma) for sigma in (1.0, 3.0, 9.0)], axis=0)
+    scene = 255 * (scene - scene.min()) / np.ptp(scene)
+    flow = cv2.resize(rng.normal(0, 3, (5, 6, 2)).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    pictures = []
+    for t in range(count):
+        moved = cv2.remap(scene, x + margin - t * flow[..., 0], y + margin - t * flow[..., 1], cv2.INTER_LINEAR)
+        pictures.append(np.clip(moved + rng.normal(0, 2, moved.shape), 0, 255).astype(np.uint8))
+    return pictures
+
+
+def _step(seed: int) -> Callable[[], Any]:
+    """A training step of the default network on a batch, as a call."""
+    optimizer = optax.adam(1e-3)
+    held = [FlowTrainState.create(PyramidFlow(seed=seed), optimizer, seed=seed)]
+    pairs = [np.stack(moved_pictures(_ROWS, _COLUMNS, 2, seed + n)) for n in range(_BATCH)]
+    samples = [{"clean": pair, "seen": pair} for pair in pairs]
+
+    def step() -> float:
+        held[0], numbers = flow_step(held[0], samples, optimizer, FlowLossSettings(), _AVERAGE_OVER)
+        return numbers["loss"]
+
+    return step
+
+
+def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timing]:
+    """One way and both ways beside DIS, along a video, and a step of training; weights are untrained.
+
+    All times are of whole calls, from pictures of bytes to flow on the host.
+    """
+    memory = flow_memory(height, width, seed)
+    pictures = moved_pictures(height, width, 4, seed)
+    first, second = pictures[:2]
+    network = NetworkFlow(PyramidFlow(seed=seed))
+    compile_s = first_call_s(lambda: network(first, second))
+    calls: dict[str, Callable[[], Any]] = {"pyramid": lambda: network(first, second)}
+    peers = {name: make_flow(name) for name in _DIS}
+    calls |= {name: lambda flow=flow: flow(first, second) for name, flow in peers.items()}
+    calls["pyramid along"] = lambda: list(flow_along(network, pictures))
+    calls["dis along"] = lambda: list(flow_along(peers["dis"], pictures))
+    taken = medians_ms(calls, repeats)
+    size, pairs = f"{width}x{height}", len(pictures) - 1
+    timings = [
+        Timing(f"pyramid, {size}, one way", taken["pyramid"], shown, taken[name], compile_s, memory["forward"])
+        for name, shown in _DIS.items()
+    ]
+    both = taken["pyramid along"] / pairs, "DIS medium, both ways", taken["dis along"] / pairs
+    timings.append(Timing(f"pyramid, {size}, both ways, a frame of a video", *both))
+    step = _step(seed)
+    step_compile_s = first_call_s(step)
+    taken = medians_ms({"step": step, "pyramid": calls["pyramid"]}, max(2, repeats // 3))
+    what = f"training step, {_BATCH} pairs of {_COLUMNS}x{_ROWS}"
+    peer = f"pyramid, {size}, one way"
+    timings.append(Timing(what, taken["step"], peer, taken["pyramid"], step_compile_s, memory["step"]))
+    return timings
+
+
+def flow_memory(height: int, width: int, seed: int) -> dict[str, float]:
+    """Largest resident memory, MiB, of a process of its own by the end of its first flow, and of a training step.
+
+    It contains Python and XLA, which compiles; `idle` is the process before either.
+    """
+    code = f"from tagjax.evaluation.flow_speed import _report_memory; _report_memory({height}, {width}, {seed})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"The process whose memory is measured failed: {done.stderr.strip()[-500:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _report_memory(height: int, width: int, seed: int) -> None:
+    import resource  # not on every system
+
+    def peak_mib() -> float:
+        unit = 2**20 if sys.platform == "darwin" else 2**10
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+    first, second = moved_pictures(height, width, 2, seed)
+    jax.block_until_ready(jax.numpy.zeros(()))
+    found = {"idle": peak_mib()}
+    NetworkFlow(PyramidFlow(seed=seed))(first, second)
+    found["forward"] = peak_mib()
+    _step(seed)()
+    found["step"] = peak_mib()
+    print(json.dumps(found))

@@ -1,0 +1,53 @@
+"""How long calls take: medians after a warm-up, and several calls that take turns."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """One measurement: ours and the peer's, milliseconds."""
+
+    what: str
+    ours_ms: float
+    peer: str
+    peer_ms: float
+    compile_s: float = 0.0
+    memory_mib: float = 0.0  # largest resident memory of a process that does this alone; 0 = not measured
+
+    @property
+    def ratio(self) -> float:
+        """Ours over the peer's: below 1 is faster."""
+        return self.ours_ms / self.peer_ms
+
+
+def median_ms(function: Callable[[], Any], repeats: int) -> float:
+    """Median time of a call, milliseconds, after one call to warm up."""
+    return medians_ms({"": function}, repeats)[""]
+
+
+def medians_ms(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median times of calls that take turns, so that whatever else the machine does slows all of them alike."""
+    for function in functions.values():
+        jax.block_until_ready(function())
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(repeats):
+        for name, function in functions.items():
+            start = time.perf_counter()
+            jax.block_until_ready(function())
+            times[name].append((time.perf_counter() - start) * 1e3)
+    return {name: float(np.median(taken)) for name, taken in times.items()}
+
+
+def first_call_s(function: Callable[[], Any]) -> float:
+    """Time of a call, seconds: of the first one, with what is compiled for it."""
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - start

@@ -1,0 +1,132 @@
+"""The default flow network: a small feature pyramid, a cost volume at each level, and learned upsampling.
+
+After PWC-Net (Sun et al., CVPR 2018) with UFlow's normalised cost volumes (Jonschkowski et al., ECCV 2020) and RAFT's
+convex upsampling (Teed and Deng, ECCV 2020), cut to what two CPU cores do at video rate.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..image.warp import gather
+from ._layers import Conv, convex_upsample, enlarge, enlarge_flow, rectify, space_to_depth
+from .cost_volume import cost_volume, normalise_features
+from .network import AbstractFlowNetwork
+
+_FINEST = 4
+_HIDDEN = 32
+_CONVEX = 2
+"""The last step's learned upsampling; the rest is bilinear: by four at once would take as long as all the costs."""
+
+
+class _Decoder(eqx.Module):
+    """Correction of the flow at one level from the costs around the flow of the level above."""
+
+    context: Conv
+    layers: tuple[Conv, ...]
+    head: Conv
+    radius: int = eqx.field(static=True)
+
+    def __init__(self, features: int, widths: Sequence[int], radius: int, *, key: PRNGKeyArray):
+        keys = jax.random.split(key, len(widths) + 2)
+        sizes = [(2 * radius + 1) ** 2 + _HIDDEN + 2, *widths]
+        self.context = Conv(features, _HIDDEN, 1, key=keys[-2])
+        self.layers = tuple(Conv(a, b, key=k) for a, b, k in zip(sizes[:-1], sizes[1:], keys[:-2], strict=True))
+        # Nearly zero: from scratch, the first estimate is no motion.
+        self.head = Conv(widths[-1], 2, gain=0.01, key=keys[-1])
+        self.radius = radius
+
+    def __call__(
+        self,
+        first: Float[Array, "height width features"],
+        second: Float[Array, "height width features"],
+        flow_px: Float[Array, "height width 2"],
+        hidden: Float[Array, "height width hidden"],
+    ) -> tuple[Float[Array, "height width 2"], Float[Array, "height width hidden"]]:
+        one, other = normalise_features(first, second)
+        other, _ = gather(other, flow_px)
+        cost = rectify(cost_volume(one, other, self.radius))
+        x = jnp.concatenate([cost, rectify(self.context(first)) + hidden, flow_px], axis=-1)
+        for layer in self.layers:
+            x = rectify(layer(x))
+        return flow_px + self.head(x), x
+
+
+class PyramidFlow(AbstractFlowNetwork):
+    """Levels at 1/4 to 1/32 of the picture, coarse to fine, then convex upsampling by four.
+
+    `widths` are the features of the levels, finest first, `radii` their search radii in pixels of the level,
+    `iterations` how often each corrects its flow with the same weights, around where the last correction led (None:
+    twice, but once at the finest and the roughest), and `decoder_widths` the hidden layers (the last is always 32).
+    """
+
+    encoders: tuple[tuple[Conv, Conv], ...]
+    decoders: tuple[_Decoder, ...]
+    upsampler: Conv
+    iterations: tuple[int, ...] = eqx.field(static=True, converter=tuple)
+    divisor: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        widths: Sequence[int] = (32, 64, 96, 96),
+        radii: Sequence[int] = (2, 3, 4, 4),
+        iterations: Sequence[int] | None = None,
+        decoder_widths: Sequence[Sequence[int]] = ((32, 32), (64, 64), (64, 64), (64, 64)),
+        *,
+        seed: int = 0,
+    ):
+        if iterations is None:
+            iterations = [1 if n in (0, len(widths) - 1) else 2 for n in range(len(widths))]
+        lengths = [len(given) for given in (widths, radii, iterations, decoder_widths)]
+        if len(set(lengths)) > 1 or not widths:
+            raise ValueError(
+                "{} widths, {} radii, {} iterations, {} decoder_widths; one of each for every level.".format(*lengths)
+            )
+        if min(iterations) < 1:
+            raise ValueError(f"iterations are {tuple(iterations)}; every level takes at least 1.")
+        count = len(widths)
+        keys = jax.random.split(jax.random.key(seed), 3 * count + 1)
+        first = Conv(3 * _FINEST**2, widths[0], key=keys[0])
+        downs = [
+            Conv(a, b, 2, stride=2, padding=0, key=keys[n + 1]) for n, (a, b) in enumerate(itertools.pairwise(widths))
+        ]
+        refines = [Conv(width, width, key=keys[count + n]) for n, width in enumerate(widths)]
+        self.encoders = tuple(zip([first, *downs], refines, strict=True))
+        self.decoders = tuple(
+            _Decoder(widths[n], [*decoder_widths[n], _HIDDEN], radii[n], key=keys[2 * count + n]) for n in range(count)
+        )
+        self.iterations = tuple(iterations)
+        self.upsampler = Conv(_HIDDEN, 9 * _CONVEX**2, 1, gain=0.1, key=keys[-1])
+        self.divisor = _FINEST * 2 ** (count - 1)
+
+    def encode(self, image: Float[Array, "height width 3"]) -> tuple[Float[Array, "_ _ _"], ...]:
+        """Features, finest first; the picture's mean and contrast are taken out."""
+        centred = image - jnp.mean(image, axis=(0, 1), keepdims=True)
+        x = space_to_depth(centred * jax.lax.rsqrt(jnp.mean(centred * centred) + 1e-3), _FINEST)
+        features = []
+        for enter, refine in self.encoders:
+            x = rectify(refine(rectify(enter(x))))
+            features.append(x)
+        return tuple(features)
+
+    def decode(
+        self, first: tuple[Float[Array, "_ _ _"], ...], second: tuple[Float[Array, "_ _ _"], ...]
+    ) -> tuple[Float[Array, "_ _ 2"], ...]:
+        height, width, _ = first[-1].shape
+        flow, hidden = jnp.zeros((height, width, 2)), jnp.zeros((height, width, _HIDDEN))
+        flows: list[Array] = []
+        levels = zip(self.decoders, self.iterations, first, second, strict=True)
+        for decoder, iterations, one, other in list(levels)[::-1]:
+            if flows:
+                flow, hidden = enlarge_flow(flow, 2), enlarge(hidden, 2)
+            for _ in range(iterations):
+                flow, hidden = decoder(one, other, flow, hidden)
+            flows.append(flow)
+        finer = convex_upsample(flow, self.upsampler(hidden), _CONVEX)
+        return (*flows, enlarge_flow(finer, _FINEST // _CONVEX))

@@ -1,0 +1,148 @@
+"""A whole run of flow training in a folder: pictures in; checkpoints, logs, weights and scores out."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ..config import TrainFlowConfig, build
+from ..evaluation.benchmark import machine
+from ..evaluation.report import write_json
+from ..flow.named import make_flow
+from ..flow.network import AbstractFlowNetwork
+from ..flow.weights import load_weights, save_weights
+from ..recording import RecordingError
+from ..sim.flow_pairs import FlowPair
+from .checkpoint import Checkpoints
+from .flow_sources import flow_dataset, installed_photographs, validation_pairs
+from .flow_step import FlowTrainState, flow_step
+from .logging import Logger
+from .loop import train
+from .step import make_optimizer
+
+_PEERS = ("zero", "dis_ultrafast", "dis_fast", "dis")
+_MOVING_PX = 0.5
+
+
+def make_network(settings: Mapping[str, Any]) -> AbstractFlowNetwork:
+    """The flow network that the settings name. Raises `ValueError` if they name something else."""
+    network = build(settings, where="flow")
+    if not isinstance(network, AbstractFlowNetwork):
+        raise ValueError(f"flow: {settings['_target_']} is no network that learns; choose flow=pyramid, for example.")
+    return network
+
+
+def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console | None = None) -> float:
+    """Train as configured and return the mean end-point error on drawn validation pairs, pixels; NaN if interrupted.
+
+    `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.npz, which `flow=<path>` uses. An
+    interrupted run goes on from its newest checkpoint when started again in the same folder.
+    """
+    console = console or Console()
+    begun = time.perf_counter()
+    network = make_network(config.flow)
+    if config.init is not None:
+        network = load_weights(network, config.init)
+    optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
+    state = FlowTrainState.create(network, optimizer, seed=config.seed)
+    samples = iter(flow_dataset(config.data, seed=config.seed, progress=config.loop.progress))
+    held_out = validation_pairs(config.data.drawn)
+    peers = {name: scores(flow_of_peer(name, held_out), held_out) for name in _PEERS}
+    with Checkpoints(folder / "checkpoints") as checkpoints:
+        if checkpoints.steps():
+            if not config.resume:
+                raise RecordingError(f"{folder} holds a run already; set resume=true or choose another folder.")
+            state, data_state = checkpoints.restore(state)
+            samples.set_state(data_state)
+            console.print(f"Resumed at step {int(state.step)} of {config.loop.num_steps}.")
+        first_step = int(state.step)
+        logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=first_step)
+
+        def validate(state: FlowTrainState) -> dict[str, float]:
+            return {f"epe_{name}": value for name, value in scores(flow_of(state.average, held_out), held_out).items()}
+
+        try:
+            with jax.default_matmul_precision(config.matmul_precision):
+                trained = train(
+                    state,
+                    samples,
+                    update=lambda state, batch: flow_step(
+                        state, batch, optimizer, config.loss, float(config.average_over)
+                    ),
+                    settings=config.loop,
+                    logger=logger,
+                    checkpoints=checkpoints,
+                    validate=validate,
+                    shown=("loss", "data", "hidden_share"),
+                )
+        finally:
+            logger.close()
+    found = {"learned": scores(flow_of(trained.state.average, held_out), held_out), **peers}
+    steps = int(trained.state.step)
+    summary = {
+        "steps": steps,
+        "epe_px": found,
+        "steps_in_this_call": steps - first_step,
+        "elapsed_s_in_this_call": round(time.perf_counter() - begun, 1),
+        "machine": machine(),
+    }
+    write_json(folder / "metrics.json", summary)
+    about = {
+        "flow": dict(config.flow),
+        "recipe": dataclasses.asdict(config),
+        "photographs": installed_photographs() if config.data.drawn.photographs else [],
+        **summary,
+    }
+    save_weights(folder / "weights.npz", trained.state.average, about)
+    console.print(_table(found))
+    if trained.interrupted:
+        console.print(f"Stopped at step {steps}; go on with hydra.run.dir={folder}")
+        return float("nan")
+    return found["learned"]["all"]
+
+
+@eqx.filter_jit
+def _flows(network: AbstractFlowNetwork, first: jax.Array, second: jax.Array) -> jax.Array:
+    return jax.vmap(lambda a, b: network.decode(network.encode(a), network.encode(b))[-1])(first, second)
+
+
+def flow_of(network: AbstractFlowNetwork, pairs: FlowPair, batch: int = 8) -> np.ndarray:
+    """The network's flow of stacked pairs, first to second."""
+    count = pairs.first.shape[0]
+    parts = [
+        np.asarray(_flows(network, pairs.first[i : i + batch], pairs.second[i : i + batch]))
+        for i in range(0, count, batch)
+    ]
+    return np.concatenate(parts)
+
+
+def flow_of_peer(name: str, pairs: FlowPair) -> np.ndarray:
+    """The flow of stacked pairs by a flow of that name (`tagjax.flow.named`)."""
+    flow = make_flow(name)
+    first, second = (np.rint(255 * np.asarray(pictures)).astype(np.uint8) for pictures in (pairs.first, pairs.second))
+    return np.stack([flow(a, b) for a, b in zip(first, second, strict=True)])
+
+
+def scores(flow_px: np.ndarray, pairs: FlowPair) -> dict[str, float]:
+    """Mean end-point error, pixels: of all pixels, visible ones, hidden ones, and those that move."""
+    truth, hidden = np.asarray(pairs.forward_px), np.asarray(pairs.occluded_first)
+    error = np.linalg.norm(flow_px - truth, axis=-1)
+    moving = np.linalg.norm(truth, axis=-1) > _MOVING_PX
+    chosen = {"all": np.ones_like(hidden), "visible": ~hidden, "hidden": hidden, "moving": moving}
+    return {name: float(np.mean(error[mask])) if mask.any() else float("nan") for name, mask in chosen.items()}
+
+
+def _table(found: Mapping[str, Mapping[str, float]]) -> Table:
+    table = Table("flow", *next(iter(found.values())), title="end-point error on drawn validation pairs, px")
+    for name, values in found.items():
+        table.add_row(name, *(f"{value:.3f}" for value in values.values()))
+    return table

@@ -1,0 +1,141 @@
+"""State and update of flow training: the unsupervised loss of a batch, Adam, and a running average of the weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int, PyTree, UInt8, UInt32
+
+from ..flow.losses import FlowLossSettings, level_terms, mean_terms, occluded, teaching_term, weighted
+from ..flow.network import AbstractFlowNetwork, flow_both_ways
+
+
+class FlowTrainState(eqx.Module):
+    """Network, the running average of its weights (which is what is kept), optimiser state, and steps done."""
+
+    network: AbstractFlowNetwork
+    average: AbstractFlowNetwork
+    optimizer_state: PyTree
+    step: Int[Array, ""]
+    key: UInt32[Array, " 2"]
+
+    @classmethod
+    def create(
+        cls, network: AbstractFlowNetwork, optimizer: optax.GradientTransformation, *, seed: int
+    ) -> FlowTrainState:
+        """The state before the first step."""
+        learnable = eqx.filter(network, eqx.is_inexact_array)
+        copy = jax.tree.map(lambda leaf: jnp.array(leaf) if eqx.is_array(leaf) else leaf, network)
+        return cls(network, copy, optimizer.init(learnable), jnp.zeros((), jnp.int32), jax.random.PRNGKey(seed))
+
+
+def pair_terms(
+    network: AbstractFlowNetwork,
+    clean: Float[Array, "2 height width 3"],
+    seen: Float[Array, "2 height width 3"],
+    hide: Float[Array, ""],
+    settings: FlowLossSettings,
+    *,
+    teach: bool,
+) -> dict[str, Float[Array, ""]]:
+    """Terms of the loss of one pair, both ways: flow from the varied pictures, held against the clean ones."""
+    first, second = clean[0], clean[1]
+    forward, backward = flow_both_ways(network, seen[0], seen[1])
+    terms = mean_terms(
+        [
+            level_terms(forward, backward, first, second, hide, settings),
+            level_terms(backward, forward, second, first, hide, settings),
+        ]
+    )
+    if not teach:
+        return {**terms, "teaching": jnp.zeros(())}
+    border = settings.self_supervision_border_px
+    small = seen[:, border:-border, border:-border]
+    there, back = flow_both_ways(network, small[0], small[1])
+    parts = [
+        teaching_term(mine[-1], whole[-1], occluded(mine[-1], other[-1]), occluded(whole[-1], whole_other[-1]), border)
+        for mine, other, whole, whole_other in ((there, back, forward, backward), (back, there, backward, forward))
+    ]
+    return {**terms, "teaching": (parts[0] + parts[1]) / 2}
+
+
+def batch_loss(
+    network: AbstractFlowNetwork,
+    clean: Float[Array, "batch 2 height width 3"],
+    seen: Float[Array, "batch 2 height width 3"],
+    step: Int[Array, ""],
+    settings: FlowLossSettings,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Mean loss over a batch, and its terms. Pictures are 0 to 1."""
+    hide = (step >= settings.occlusion_after).astype(jnp.float32)
+
+    def terms(teach: bool) -> dict[str, Array]:
+        one = jax.vmap(lambda c, s: pair_terms(network, c, s, hide, settings, teach=teach))
+        return jax.tree.map(jnp.mean, one(clean, seen))
+
+    if settings.self_supervision > 0:
+        begun = (step - settings.self_supervision_after).astype(jnp.float32)
+        ramp = jnp.clip(begun / max(settings.self_supervision_ramp, 1), 0.0, 1.0)
+        found = jax.lax.cond(ramp > 0, lambda: terms(True), lambda: terms(False))
+        found["teaching"] = ramp * found["teaching"]
+    else:
+        found = terms(False)
+    return weighted(found, settings), found
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _update(
+    pictures: tuple[UInt8[Array, "batch 2 height width 3"], UInt8[Array, "batch 2 height width 3"]],
+    state: FlowTrainState,
+    optimizer: optax.GradientTransformation,
+    settings: FlowLossSettings,
+    average_over: float,
+) -> tuple[FlowTrainState, dict[str, Array]]:
+    clean, seen = (picture.astype(jnp.float32) / 255 for picture in pictures)
+    learnable, rest = eqx.partition(state.network, eqx.is_inexact_array)
+
+    def loss(learnable: PyTree) -> tuple[Array, dict[str, Array]]:
+        return batch_loss(eqx.combine(learnable, rest), clean, seen, state.step, settings)
+
+    (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(learnable)
+    norm = optax.tree.norm(gradient)
+    usable = jnp.isfinite(norm) & jnp.isfinite(value)
+    safe = jax.tree.map(lambda g: jnp.where(usable, g, jnp.zeros_like(g)), gradient)
+    with jax.numpy_dtype_promotion("standard"):  # Optax takes powers of its integer step count
+        updates, optimizer_state = optimizer.update(safe, state.optimizer_state, learnable)
+    keep = lambda new, old: jnp.where(usable, new, old)  # noqa: E731
+    learnt = jax.tree.map(keep, optax.apply_updates(learnable, updates), learnable)
+    # The average begins as the mean of all steps, so that the first weights are soon forgotten.
+    done = state.step.astype(jnp.float32)
+    share = jnp.maximum(1 / average_over, 1 / (done + 1))
+    averaged, _ = eqx.partition(state.average, eqx.is_inexact_array)
+    averaged = jax.tree.map(lambda a, b: a + share * (b - a), averaged, learnt)
+    after = FlowTrainState(
+        eqx.combine(learnt, rest),
+        eqx.combine(averaged, rest),
+        jax.tree.map(keep, optimizer_state, state.optimizer_state),
+        state.step + 1,
+        state.key,
+    )
+    numbers = {**terms, "loss": value, "gradient_norm": norm, "skipped": 1.0 - usable.astype(jnp.float32)}
+    return after, numbers
+
+
+def flow_step(
+    state: FlowTrainState,
+    samples: Sequence[dict[str, np.ndarray]],
+    optimizer: optax.GradientTransformation,
+    settings: FlowLossSettings,
+    average_over: float,
+) -> tuple[FlowTrainState, dict[str, float]]:
+    """One update on a batch of `vary`'s pairs. A loss or gradient that is not finite changes nothing but the count."""
+    if not samples:
+        raise ValueError("A training step needs at least one pair.")
+    clean, seen = (jnp.asarray(np.stack([sample[name] for sample in samples])) for name in ("clean", "seen"))
+    state, numbers = _update((clean, seen), state, optimizer, settings, average_over)
+    return state, {name: float(value) for name, value in numbers.items()}

@@ -1,0 +1,543 @@
+"""Estimates of any size, pictures that are checked, weights on disk, named flows and their cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import io
+import itertools
+import json
+import pickle
+import threading
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic_clips as synthetic
+import yaml
+from jaxtyping import Array, Float
+
+import tagjax.flow.estimate
+import tagjax.flow.weights
+from tagjax.config import build
+from tagjax.data.clips import load_clip
+from tagjax.data.flow_cache import pair_flow
+from tagjax.data.store import open_recording, save_recording
+from tagjax.flow.estimate import NetworkFlow, agreement, estimate, one_way, padding
+from tagjax.flow.losses import occluded
+from tagjax.flow.named import CLASSICAL, flow_along, flow_key, make_flow
+from tagjax.flow.network import AbstractFlowNetwork
+from tagjax.flow.pictures import as_bytes, check_pictures
+from tagjax.flow.pyramid import PyramidFlow
+from tagjax.flow.weights import load_network, load_weights, save_weights, weights_about
+
+CONF = Path(__file__).parents[1] / "conf" / "flow"
+SETTINGS = {
+    "_target_": "tagjax.flow.pyramid.PyramidFlow",
+    "widths": [8, 8],
+    "radii": [1, 1],
+    "iterations": [1, 1],
+    "decoder_widths": [[8], [8]],
+}
+TRACED: list[tuple[int, ...]] = []
+
+
+class Painted(AbstractFlowNetwork):
+    """Flow that is painted on the first picture: red and green are its components, 20 pixels from 0 to 1."""
+
+    scale_px: Float[Array, ""]
+    divisor: int = eqx.field(static=True)
+
+    def encode(self, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
+        TRACED.append(image.shape)
+        return image
+
+    def decode(self, first: Any, second: Any) -> tuple[Float[Array, "_ _ 2"], ...]:
+        return (self.scale_px * (first[..., :2] - 0.5),)
+
+
+PAINTED = Painted(divisor=16, scale_px=jnp.asarray(20.0))
+
+
+def paint(flow_px: Any, height: int = 40, width: int = 56) -> np.ndarray:
+    """The picture on which `PAINTED` reads a flow."""
+    picture = np.full((height, width, 3), 0.25, np.float32)
+    picture[..., :2] = np.asarray(flow_px, np.float32) / 20 + 0.5
+    return picture
+
+
+def small_network(seed: int = 0, gain: float = 1.0) -> PyramidFlow:
+    """A small pyramid, its flow heads enlarged."""
+    network = build({**SETTINGS, "seed": seed})
+    heads = lambda n: [decoder.head.weight for decoder in n.decoders]  # noqa: E731
+    return eqx.tree_at(heads, network, [gain * weight for weight in heads(network)])
+
+
+def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    """Smooth noise in colour, uint8."""
+    rough = jnp.asarray(np.random.default_rng(seed).uniform(size=(height // 4 + 2, width // 4 + 2, 3)), jnp.float32)
+    smooth = jax.image.resize(rough, (height + 8, width + 8, 3), "cubic")[4:-4, 4:-4]
+    return np.asarray(jnp.clip(255 * smooth, 0, 255)).astype(np.uint8)
+
+
+# Pictures
+
+
+def test_every_kind_of_picture_becomes_the_same_rgb():
+    grey = texture(9, 12)[..., 0]
+    rgb = np.repeat(grey[..., None], 3, axis=-1)
+    for same in (grey, grey[..., None], rgb, np.dstack([rgb, grey])):
+        for one in check_pictures(same, rgb):
+            np.testing.assert_array_equal(one, rgb)
+            assert one.dtype == np.uint8
+    for same in (grey.astype(np.uint16) * 257, grey / 255, (grey / 255).astype(np.float16)):
+        first, second = check_pictures(same, rgb)
+        assert first.dtype == second.dtype == np.float32
+        np.testing.assert_allclose(first, rgb / 255, atol=1e-3)
+        np.testing.assert_allclose(second, rgb / 255, atol=1e-6)
+        np.testing.assert_array_equal(as_bytes(second), rgb)
+
+
+GOOD = np.zeros((8, 9, 3), np.uint8)
+HOLED = np.zeros((8, 9))
+HOLED[2, 3] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        (GOOD, None, "One picture is missing; a flow needs two"),
+        (GOOD, GOOD[:, :8], "9 x 8 and 8 x 8 pixels; a flow needs one size"),
+        (GOOD, GOOD.transpose(2, 0, 1), r"shape \(3, 8, 9\).*Channels come last"),
+        (GOOD[None], GOOD[None], "Give one picture at a time"),
+        (GOOD[..., :2], GOOD, r"shape \(8, 9, 2\); expected a grey or RGB picture"),
+        (HOLED, GOOD, "The first picture holds 1 values that are not finite"),
+        (GOOD, HOLED + np.inf, "The second picture holds 72 values"),
+        (GOOD.astype(float) + 255, GOOD, "from 255 to 255; floats count from 0 to 1"),
+        (GOOD.astype(float) - 1, GOOD, "from -1 to -1; floats count"),
+        (GOOD.astype(np.int32), GOOD, "int32; expected"),
+        (GOOD.astype(bool), GOOD, "bool; expected"),
+        (GOOD[:0], GOOD, "is empty"),
+        ("a.png", GOOD, "expected a grey or RGB picture"),
+        ([[1, 2], [3]], GOOD, "expected a grey or RGB picture"),
+    ],
+)
+def test_what_is_no_pair_of_pictures_is_refused(first, second, message):
+    arrays = isinstance(first, np.ndarray) and isinstance(second, np.ndarray)
+    flows = (make_flow("zero"), make_flow("dis_ultrafast"), NetworkFlow(PAINTED)) if arrays else ()
+    for flow in (check_pictures, lambda *pair: estimate(PAINTED, *pair), *flows):
+        with pytest.raises(ValueError, match=message):
+            flow(first, second)
+
+
+@pytest.mark.parametrize("name", sorted(CLASSICAL))
+def test_classical_flows_take_tiny_grey_and_deep_pictures(name):
+    flow = make_flow(name)
+    for shape in ((1, 1), (5, 7), (13, 40)):
+        picture = texture(*shape)
+        found = flow(picture, picture)
+        assert found.shape == (*shape, 2)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, 0, atol=0.2)
+    before, after = texture(48, 64)[..., 0], np.roll(texture(48, 64)[..., 0], 2, axis=1)
+    grey = flow(before, after)
+    np.testing.assert_array_equal(flow(np.dstack([before] * 3), np.dstack([after] * 3)), grey)
+    np.testing.assert_array_equal(flow(before.astype(np.uint16) * 257, after.astype(np.uint16) * 257), grey)
+    assert name == "zero" or abs(np.median(grey[8:-8, 8:-8, 0]) - 2) < 0.3
+
+
+# Estimates
+
+
+@pytest.mark.parametrize("size", [1, 31, 32, 63, 64, 65, 424])
+@pytest.mark.parametrize("divisor", [8, 32, 64, 96])
+def test_padding_is_the_least_that_fits(size, divisor):
+    before, after = padding(size, divisor)
+    whole = before + size + after
+    assert whole % divisor == 0
+    assert whole >= 64
+    assert 0 <= after - before <= 1
+    assert whole - divisor < max(size, 64)
+
+
+@pytest.mark.parametrize("shape", [(40, 56), (1, 1), (3, 70), (64, 80), (65, 79)])
+def test_flow_is_cut_back_to_where_the_picture_lies(shape):
+    flow = np.random.default_rng(1).uniform(-9, 9, (*shape, 2))
+    first, second = paint(flow, *shape), paint(-flow[::-1], *shape)
+    found = estimate(PAINTED, first, second)
+    np.testing.assert_allclose(found.forward_px, flow, atol=1e-4)
+    np.testing.assert_allclose(found.backward_px, -flow[::-1], atol=1e-4)
+    np.testing.assert_allclose(one_way(PAINTED, first, second), flow, atol=1e-4)
+    np.testing.assert_allclose(NetworkFlow(PAINTED)(first, second), flow, atol=1e-4)
+    assert all(np.shape(leaf)[:2] == shape for leaf in jax.tree.leaves(found))
+
+
+def test_sizes_share_what_is_compiled():
+    TRACED.clear()
+    network = Painted(divisor=24, scale_px=jnp.asarray(7.0))
+    for shape in ((70, 70), (72, 72), (65, 71)):
+        estimate(network, paint(0, *shape), paint(0, *shape))
+        one_way(network, paint(0, *shape), paint(0, *shape))
+    assert TRACED == [(72, 72, 3)]
+    estimate(Painted(divisor=24, scale_px=jnp.asarray(8.0)), paint(0, 66, 66), paint(0, 66, 66))
+    assert len(TRACED) == 1
+    estimate(network, paint(0, 73, 70), paint(0, 73, 70))
+    assert TRACED[1:] == [(96, 72, 3)]
+
+
+def test_what_leaves_the_picture_or_does_not_come_back_is_hidden():
+    there = estimate(PAINTED, paint((3.0, -2.0)), paint((-3.0, 2.0)))
+    inside = np.zeros((40, 56), bool)
+    inside[2:, :-3] = True
+    np.testing.assert_array_equal(there.forward_occluded, ~inside)
+    np.testing.assert_array_equal(there.backward_occluded, ~inside[::-1, ::-1])
+    np.testing.assert_allclose(there.forward_confidence, inside, atol=1e-5)
+    # Half a pixel beyond the last pixel's centre still is the picture.
+    edge = estimate(PAINTED, paint((0.4, 0.4)), paint((-0.4, -0.4)))
+    assert not edge.forward_occluded.any()
+    one_sided = estimate(PAINTED, paint((3.0, 0.0)), paint((0.0, 0.0)))
+    tolerance = 0.01 * 9 + 0.5
+    np.testing.assert_allclose(one_sided.forward_confidence[:, :-3], tolerance / (tolerance + 9), atol=1e-5)
+    np.testing.assert_allclose(one_sided.backward_confidence, tolerance / (tolerance + 9), atol=1e-5)
+    assert one_sided.forward_occluded.all()
+
+
+def test_confidence_is_half_where_a_pixel_begins_to_be_hidden():
+    rng = np.random.default_rng(2)
+    flow = jnp.asarray(rng.uniform(-1, 1, (20, 30, 2)), jnp.float32)
+    back = -flow + jnp.asarray(rng.uniform(-1.2, 1.2, (20, 30, 2)), jnp.float32)
+    inner = (slice(2, -2), slice(2, -2))
+    confidence = agreement(flow, back)
+    hidden = np.asarray(occluded(flow, back))[inner]
+    np.testing.assert_array_equal(np.asarray(confidence)[inner] <= 0.5, hidden)
+    assert 0.2 < hidden.mean() < 0.8
+    assert np.all((np.asarray(confidence) >= 0) & (np.asarray(confidence) <= 1))
+
+
+def test_confidence_has_the_gradient_of_its_formula(gradients_agree):
+    rng = np.random.default_rng(3)
+    flow = rng.uniform(0.1, 0.4, (4, 5, 2))
+    gradients_agree(lambda f, b: agreement(f, b), (flow, -flow + rng.uniform(-0.3, 0.3, (4, 5, 2))))
+
+
+class Wider(AbstractFlowNetwork):
+    """A network whose pictures have to be larger."""
+
+    divisor: int = eqx.field(static=True)
+    network: PyramidFlow
+
+    def encode(self, image: Float[Array, "height width 3"]) -> Any:
+        return self.network.encode(image)
+
+    def decode(self, first: Any, second: Any) -> tuple[Float[Array, "_ _ 2"], ...]:
+        return self.network.decode(first, second)
+
+
+def test_padding_hardly_changes_the_inside():
+    network = small_network(gain=10.0)
+    first, second = texture(112, 128, 1), np.roll(texture(112, 128, 1), 2, axis=1)
+    plain = NetworkFlow(network)(first, second)
+    padded = NetworkFlow(Wider(divisor=72, network=network))(first, second)  # by 16 rows and 8 columns at each end
+    gap = padded - plain
+    inner = (slice(24, -24), slice(24, -24))
+    assert np.std(plain) > 0.3
+    assert np.sqrt(np.mean(gap[inner] ** 2)) < 0.1 * np.std(plain)
+    assert np.abs(gap).max() > 0.01  # the edges do change
+
+
+def test_estimates_go_through_transformations():
+    network = small_network(gain=30.0)
+    first, second = (jnp.asarray(texture(70, 66, n), jnp.float32) / 255 for n in (1, 2))
+    eager = estimate(network, first, second)
+    traced = eqx.filter_jit(estimate)(network, first, second)
+    for one, other in zip(jax.tree.leaves(eager), jax.tree.leaves(traced), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4)
+    np.testing.assert_allclose(one_way(network, first, second), eager.forward_px, atol=1e-4)
+    gradient = eqx.filter_grad(lambda n: jnp.sum(one_way(n, first, second) ** 2))(network)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+    assert any(np.any(leaf != 0) for leaf in jax.tree.leaves(gradient))
+
+
+def test_one_batch_of_both_ways_is_what_two_calls_are(monkeypatch):
+    network = small_network(gain=30.0)
+    pictures = texture(64, 64, 1), texture(64, 64, 2)
+    there, back = estimate(network, *pictures).forward_px, estimate(network, *pictures).backward_px
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    batch = estimate(network, *pictures)
+    np.testing.assert_allclose(batch.forward_px, there, atol=1e-4)
+    np.testing.assert_allclose(batch.backward_px, back, atol=1e-4)
+
+
+def test_a_failure_in_the_second_thread_is_told(monkeypatch):
+    flow = NetworkFlow(small_network(gain=30.0))
+    pictures = texture(64, 64, 1), texture(64, 64, 2)
+    flow(*pictures)
+
+    def failing(network, picture):
+        if threading.current_thread() is not threading.main_thread():
+            raise FloatingPointError("told")
+        return picture
+
+    monkeypatch.setattr(tagjax.flow.estimate, "_encode", failing)
+    key = next(key for key in tagjax.flow.estimate._compiled if key[2][-1] == ((64, 64, 3), jnp.uint8))
+    tagjax.flow.estimate._compiled.add((failing, *key[1:]))
+    with pytest.raises(FloatingPointError, match="told"):
+        flow(*pictures)
+
+
+def test_a_video_is_encoded_once_and_flows_both_ways(monkeypatch):
+    flow = NetworkFlow(small_network(gain=30.0))
+    pictures = [texture(66, 70, n) for n in range(4)]
+    direct = [(flow(a, b), flow(b, a)) for a, b in itertools.pairwise(pictures)]
+    encode, seen = tagjax.flow.estimate._encode, []
+    monkeypatch.setattr(tagjax.flow.estimate, "_encode", lambda *args: (seen.append(1), encode(*args))[1])
+    for found, expected in zip(flow_along(flow, pictures), direct, strict=True):
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-5)
+    assert len(seen) == 4
+    dis = make_flow("dis_ultrafast")
+    ((there, back),) = flow_along(dis, pictures[:2])
+    np.testing.assert_array_equal(there, dis(*pictures[:2]))
+    np.testing.assert_array_equal(back, dis(pictures[1], pictures[0]))
+    assert list(flow_along(flow, pictures[:1])) == list(flow_along(dis, [])) == []
+    with pytest.raises(ValueError, match="a flow needs one size"):
+        list(flow_along(flow, [pictures[0], pictures[1][:50]]))
+
+
+# Weights
+
+
+@pytest.fixture
+def packaged(tmp_path, monkeypatch) -> Path:
+    """An empty folder in place of the packaged weights."""
+    folder = tmp_path / "weights"
+    monkeypatch.setattr(tagjax.flow.weights, "PACKAGED", folder)
+    return folder
+
+
+def _same(one: Any, other: Any) -> None:
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def test_weights_come_back_with_what_is_told_of_them(tmp_path):
+    network, path = small_network(3), tmp_path / "new" / "a.npz"
+    about = {"flow": SETTINGS, "recipe": {"seed": 3, "sizes": (1, 2)}, "epe_px": np.float32(0.5), "data": ["a"]}
+    save_weights(path, network, about)
+    _same(load_network(path), network)
+    _same(load_weights(small_network(4), str(path)), network)
+    told = weights_about(path)
+    assert told["flow"] == SETTINGS
+    assert told["recipe"] == {"seed": 3, "sizes": [1, 2]}
+    assert told["epe_px"] == 0.5
+    again = tmp_path / "b.npz"
+    save_weights(again, network, about)
+    assert again.read_bytes() == path.read_bytes()
+    assert [item.name for item in path.parent.iterdir()] == ["a.npz"]
+    with np.load(path, allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["encoders.1.0.weight"], network.encoders[1][0].weight)
+    save_weights(again, network, about, half=True)
+    assert again.stat().st_size < 0.7 * path.stat().st_size
+    for a, b in zip(jax.tree.leaves(load_network(again)), jax.tree.leaves(network), strict=True):
+        assert a.dtype == jnp.float32
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
+
+
+def test_weights_that_say_something_else_than_they_are_are_not_written(tmp_path):
+    path = tmp_path / "a.npz"
+    for about, message in (
+        ({}, "expected `flow`"),
+        ({"flow": {**SETTINGS, "widths": [8, 9]}}, "build another network"),
+        ({"flow": {**SETTINGS, "radii": [1]}}, "does not take the settings"),
+        ({"flow": {**SETTINGS, "_target_": "os.system"}}, "expected a network of tagjax.flow"),
+        ({"flow": SETTINGS, "data": {1, 2}}, "expected numbers, texts"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_weights(path, small_network(), about)
+    broken = eqx.tree_at(lambda n: n.upsampler.bias, small_network(), jnp.full((36,), jnp.nan))
+    with pytest.raises(ValueError, match=r"upsampler\.bias is not finite"):
+        save_weights(path, broken, {"flow": SETTINGS})
+    assert not list(tmp_path.iterdir())
+
+
+def _rewritten(source: Path, target: Path, change: dict[str, bytes | None]) -> Path:
+    """A copy of a file of weights with some members replaced, added or (None) left out."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in dict.fromkeys([*old.namelist(), *change]):
+            content = change[name] if name in change else old.read(name)
+            if content is not None:
+                new.writestr(name, content)
+    return target
+
+
+def _npy(array: np.ndarray, **settings: Any) -> bytes:
+    held = io.BytesIO()
+    np.lib.format.write_array(held, array, **settings)
+    return held.getvalue()
+
+
+class _Touch:
+    """Unpickling this makes a file."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return (Path.touch, (self.path,))
+
+
+def test_damaged_foreign_and_unfit_files_are_refused_in_words(tmp_path):
+    good, bad, trap = tmp_path / "good.npz", tmp_path / "bad.npz", tmp_path / "trap"
+    save_weights(good, small_network(), {"flow": SETTINGS})
+    content, name = good.read_bytes(), "upsampler.bias.npy"
+    told = weights_about(good)
+
+    def refused(message: str) -> None:
+        for load in (load_network, lambda path: load_weights(small_network(), path), make_flow):
+            with pytest.raises(ValueError, match=message):
+                load(str(bad))
+
+    for cut in (0, 10, len(content) // 2, len(content) - 1):
+        bad.write_bytes(content[:cut])
+        refused("no weights of a flow network")
+    at = content.index(b"decoders.1.layers.0.weight.npy") + 400
+    bad.write_bytes(content[:at] + bytes([content[at] ^ 255]) + content[at + 1 :])
+    refused("decoders.1.layers.0.weight cannot be read|holds")
+    np.savez(bad, weight=np.zeros(3))
+    refused("no weights of a flow network")
+    for about, message in (
+        ({**told, "format": "other"}, "an archive, but no weights"),
+        ({**told, "version": 2}, "version 2; this release reads 1"),
+        ([1], "an archive, but no weights"),
+    ):
+        _rewritten(good, bad, {"about.json": json.dumps(about).encode()})
+        refused(message)
+    objects = np.array([_Touch(trap)], dtype=object)
+    for array, message in (
+        (_npy(np.zeros(35, np.float32)), r"upsampler.bias is float32 of shape \(35,\); this network has .*\(36,\)"),
+        (_npy(np.zeros(36, np.int64)), "upsampler.bias is int64"),
+        (_npy(objects, allow_pickle=True), "upsampler.bias is object"),
+        (_npy(np.full(36, np.inf, np.float32)), "upsampler.bias holds values that are not finite"),
+        (_npy(np.zeros(36, np.float32))[:-4], "upsampler.bias holds 140 of 144 bytes"),
+        (pickle.dumps(_Touch(trap)), "upsampler.bias cannot be read"),
+        (None, r"1 arrays are missing \(upsampler.bias\), 0 are unknown"),
+    ):
+        _rewritten(good, bad, {name: array})
+        refused(message)
+    _rewritten(good, bad, {"more.npy": _npy(np.zeros(1))})
+    refused(r"0 arrays are missing \(\), 1 are unknown \(more\)")
+    assert not trap.exists()
+    with pytest.raises(ValueError, match="No weights at"):
+        load_network(tmp_path / "none.npz")
+
+
+def test_settings_of_a_file_name_nothing_but_networks(tmp_path):
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    save_weights(good, small_network(), {"flow": SETTINGS})
+    told = weights_about(good)
+    for target in (
+        "os.system",
+        "tagjax.flow.pyramid._Decoder",
+        "tagjax.flow.estimate.NetworkFlow",
+        "tagjax.flow.weights.Path",
+        "tagjax.flow.network.AbstractFlowNetwork",
+        "tagjax.flow.none.PyramidFlow",
+        "tagjax.flow.pyramid",
+        None,
+    ):
+        flow = {**SETTINGS, "_target_": target}
+        _rewritten(good, bad, {"about.json": json.dumps({**told, "flow": flow}).encode()})
+        with pytest.raises(ValueError, match="expected a network of tagjax"):
+            load_network(bad)
+    # No memory is taken for what a file merely claims to hold.
+    flow = {**SETTINGS, "widths": [8, 10**7]}
+    _rewritten(good, bad, {"about.json": json.dumps({**told, "flow": flow}).encode()})
+    with pytest.raises(ValueError, match=r"this network has floats of shape \(2, 2, 8, 10000000\)|10000000"):
+        load_network(bad)
+
+
+def test_packaged_weights_are_found_by_name_and_by_network(packaged):
+    with pytest.raises(
+        ValueError, match=r"No weights are packaged for tagjax.flow.pyramid.PyramidFlow \(there are: none"
+    ):
+        load_weights(small_network())
+    with pytest.raises(
+        ValueError, match=r"Unknown optical flow 'pyramid'; expected one of zero, dis.*weights \(none\)"
+    ):
+        make_flow("pyramid")
+    save_weights(packaged / "pyramid.npz", small_network(5), {"flow": SETTINGS})
+    _same(load_weights(small_network()), small_network(5))
+    _same(load_weights(small_network(), "pyramid"), small_network(5))
+    flow = make_flow("pyramid")
+    assert isinstance(flow, NetworkFlow)
+    _same(flow.network, small_network(5))
+    assert make_flow("pyramid") is flow
+    with pytest.raises(ValueError, match="Unknown optical flow 'pyramids'"):
+        flow_key("pyramids")
+
+
+# Named flows
+
+
+@pytest.fixture
+def stored(tmp_path) -> Path:
+    """A recording on disk whose pictures change."""
+    made = synthetic.enlarged(synthetic.recording(6), 3)
+    colour = np.stack([np.roll(texture(72, 96), 2 * t, axis=1) for t in range(6)])
+    save_recording(dataclasses.replace(made, colour=colour), tmp_path / "a.zarr")
+    return tmp_path / "a.zarr"
+
+
+def test_kept_flow_is_that_of_the_weights(stored, tmp_path):
+    one, other = tmp_path / "one.npz", tmp_path / "other.npz"
+    save_weights(one, small_network(1, 30.0), {"flow": SETTINGS})
+    save_weights(other, small_network(2, 30.0), {"flow": SETTINGS})
+    recording = open_recording(stored)
+    first = pair_flow(recording, 1, 6, str(one))
+    second = pair_flow(recording, 1, 6, str(other))
+    assert np.abs(first[0] - second[0]).max() > 0.05
+    keys = {flow_key(str(path)) for path in (one, other)}
+    assert len(keys) == 2
+    assert {folder.name for folder in (stored / "cache" / "flow").iterdir()} == keys
+    assert all(key.startswith("PyramidFlow-") for key in keys)
+    flow = NetworkFlow(load_network(one))
+    pictures = np.asarray(recording.colour[0:2])
+    np.testing.assert_allclose(first[0][0], flow(pictures[0], pictures[1]), atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(first[1][0], flow(pictures[1], pictures[0]), atol=2e-3, rtol=2e-3)
+    # Another training in the same file gives another flow, not the kept one.
+    save_weights(one, small_network(2, 30.0), {"flow": SETTINGS})
+    np.testing.assert_array_equal(pair_flow(recording, 1, 6, str(one))[0], second[0])
+    with pytest.raises(ValueError, match="No weights at"):
+        pair_flow(recording, 1, 6, str(tmp_path / "none.npz"))
+
+
+def test_clips_take_any_named_flow(stored, tmp_path):
+    path = tmp_path / "w.npz"
+    save_weights(path, small_network(1, 30.0), {"flow": SETTINGS})
+    recording = open_recording(stored)
+    assert not np.any(load_clip(recording, 0, 6, stride=2, flow="zero").frames.forward_px)
+    clip = load_clip(recording, 0, 6, stride=2, flow=str(path))
+    np.testing.assert_array_equal(clip.frames.forward_px[0], 0)
+    expected = pair_flow(recording, 2, 3, str(path))[0][0, ::2, ::2] / 2
+    np.testing.assert_allclose(clip.frames.forward_px[2], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*sorted(CLASSICAL), "pyramid"])
+def test_flow_files_name_every_setting(name):
+    settings = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    given = set(settings) - {"_target_"}
+    if name == "pyramid":
+        built = eqx.filter_eval_shape(build, settings)
+        assert eqx.tree_equal(built, eqx.filter_eval_shape(PyramidFlow))
+        assert given == set(inspect.signature(PyramidFlow).parameters) - {"seed"}
+    else:
+        built = build(settings)
+        assert given == set(inspect.signature(type(built)).parameters)
+        pictures = texture(48, 64), np.roll(texture(48, 64), 2, axis=1)
+        np.testing.assert_array_equal(built(*pictures), make_flow(name)(*pictures))

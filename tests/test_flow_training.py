@@ -1,0 +1,418 @@
+"""Flow training: where pictures come from, how pairs are varied, the update, and a run that stops and goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+from pathlib import Path
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jaxtyping import Array, Float
+
+from tagjax.config import ConfigError, TrainFlowConfig, from_mapping
+from tagjax.data.picture_pairs import (
+    ImageFolder,
+    PairSource,
+    StackedPairs,
+    VariationSettings,
+    open_sequence,
+    pair_dataset,
+    vary,
+)
+from tagjax.flow.losses import FlowLossSettings
+from tagjax.flow.network import AbstractFlowNetwork
+from tagjax.flow.pyramid import PyramidFlow
+from tagjax.recording import RecordingError
+from tagjax.sim.flow_pairs import FlowPairSettings
+from tagjax.training.checkpoint import Checkpoints
+from tagjax.training.flow_run import flow_of, flow_of_peer, run_flow_training, scores
+from tagjax.training.flow_sources import DrawnSettings, drawn_pairs, flow_dataset, validation_pairs
+from tagjax.training.flow_step import FlowTrainState, batch_loss, flow_step
+
+SMALL = {
+    "_target_": "tagjax.flow.pyramid.PyramidFlow",
+    "widths": [8, 8],
+    "radii": [1, 1],
+    "decoder_widths": [[8], [8]],
+}
+PLAIN = VariationSettings(
+    height=32, width=48, scale=(1.0, 1.0), turn_deg=0.0, gain=0.0, gamma=0.0, tint=0.0, unlike=0.0, noise=0.0,
+    grey_share=0.0,
+)  # fmt: skip
+
+
+def small_network(seed: int = 0) -> PyramidFlow:
+    return PyramidFlow(widths=(8, 8), radii=(1, 1), decoder_widths=((8,), (8,)), seed=seed)
+
+
+def smooth_pictures(count: int, height: int, width: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack(
+        [cv2.GaussianBlur(rng.integers(0, 256, (height, width, 3), np.uint8), (0, 0), 2) for _ in range(count)]
+    )
+
+
+# Sequences
+
+
+def test_folder_of_pictures_is_read_in_order_of_names_as_rgb(tmp_path: Path) -> None:
+    pictures = smooth_pictures(3, 40, 50)
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), picture[..., ::-1])
+    (tmp_path / "notes.txt").write_text("no picture")
+    found = open_sequence(str(tmp_path), tmp_path / "cache")
+    assert found.shape == (3, 40, 50, 3)
+    np.testing.assert_array_equal(found[1], pictures[1])
+
+
+def test_grey_and_16_bit_pictures_become_rgb_of_8_bits(tmp_path: Path) -> None:
+    grey = np.arange(40 * 50, dtype=np.uint16).reshape(40, 50) * 32
+    cv2.imwrite(str(tmp_path / "a.png"), grey)
+    cv2.imwrite(str(tmp_path / "b.png"), (grey >> 8).astype(np.uint8))
+    folder = ImageFolder(tmp_path)
+    assert folder[0].shape == (40, 50, 3)
+    np.testing.assert_allclose(folder[0].astype(int), folder[1].astype(int), atol=1)
+
+
+@pytest.mark.parametrize("broken", ["one", "sizes", "cut", "nothing", "ending"])
+def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
+    pictures = smooth_pictures(2, 40, 50)
+    names = ["a.png", "b.png"]
+    for name, picture in zip(names, pictures, strict=True):
+        cv2.imwrite(str(tmp_path / name), picture)
+    path, told = str(tmp_path), ""
+    if broken == "one":
+        (tmp_path / "b.png").unlink()
+        told = "holds 1 pictures"
+    elif broken == "sizes":
+        cv2.imwrite(str(tmp_path / "b.png"), pictures[1][:30])
+        told = "50 x 30 pixels"
+    elif broken == "cut":
+        (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
+        told = "cannot be read as a picture"
+    elif broken == "nothing":
+        path, told = str(tmp_path / "nowhere"), "found nothing"
+    else:
+        (tmp_path / "x.txt").write_text("?")
+        path, told = str(tmp_path / "x.txt"), "found a file"
+    with pytest.raises(RecordingError, match=told):
+        open_sequence(path, tmp_path / "cache")[1]
+
+
+def write_video(path: Path, frames: np.ndarray) -> None:
+    height, width = frames.shape[1:3]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (width, height))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no MJPG videos")
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+
+
+def test_video_is_decoded_once_and_kept(tmp_path: Path) -> None:
+    frames = smooth_pictures(5, 64, 96)
+    write_video(tmp_path / "film.avi", frames)
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    found = open_sequence(str(tmp_path / "film.avi"), cache)
+    assert found.shape == (5, 64, 96, 3)
+    # JPEG, and colour at half the resolution: nearer to its own frame than to any other.
+    for number in range(5):
+        distance = [np.mean(np.abs(found[number].astype(float) - frame)) for frame in frames.astype(float)]
+        assert int(np.argmin(distance)) == number
+    kept = list(cache.iterdir())
+    open_sequence(str(tmp_path / "film.avi"), cache)
+    assert list(cache.iterdir()) == kept
+
+
+def test_broken_video_says_so_and_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"no video at all")
+    with pytest.raises(RecordingError, match="cannot be decoded"):
+        open_sequence(str(tmp_path / "film.mp4"), tmp_path / "cache")
+    assert not (tmp_path / "cache").exists() or not list((tmp_path / "cache").iterdir())
+
+
+def test_pairs_are_the_gaps_apart() -> None:
+    frames = np.arange(5, dtype=np.uint8).reshape(5, 1, 1, 1) * np.ones((1, 4, 4, 3), np.uint8)
+    source = PairSource(frames, (1, 3))
+    found = {tuple(source[i][:, 0, 0, 0].tolist()) for i in range(len(source))}
+    assert found == {(0, 1), (1, 2), (2, 3), (3, 4), (0, 3), (1, 4)}
+    with pytest.raises(RecordingError, match="7 frames apart"):
+        PairSource(frames, (7,))
+
+
+# Variation
+
+
+def test_without_variation_the_cut_is_a_piece_of_the_pictures() -> None:
+    pair = smooth_pictures(2, 64, 80)
+    for seed in range(6):
+        cut = vary(pair, np.random.default_rng(seed), PLAIN)
+        np.testing.assert_array_equal(cut["clean"], cut["seen"])
+        best = min(
+            np.mean(np.abs(cv2.matchTemplate(candidate[which], cut["clean"][0], cv2.TM_SQDIFF_NORMED).min()))
+            for which in (0, 1)
+            for candidate in (pair, pair[:, ::-1], pair[:, :, ::-1], pair[:, ::-1, ::-1])
+            for candidate in (np.ascontiguousarray(candidate),)
+        )
+        assert best < 2e-3  # cut between pixels
+
+
+def test_both_pictures_are_cut_alike_and_variation_spares_the_clean_ones() -> None:
+    picture = smooth_pictures(1, 100, 120)[0]
+    pair = np.stack([picture, picture])
+    settings = VariationSettings(height=64, width=64)
+    for seed in range(4):
+        found = vary(pair, np.random.default_rng(seed), settings)
+        np.testing.assert_array_equal(found["clean"][0], found["clean"][1])
+        assert np.any(found["seen"] != found["clean"])
+        again = vary(pair, np.random.default_rng(seed), settings)
+        np.testing.assert_array_equal(found["seen"], again["seen"])
+
+
+def test_small_pictures_are_enlarged_to_the_cut() -> None:
+    found = vary(smooth_pictures(2, 20, 20), np.random.default_rng(0), PLAIN)
+    assert found["clean"].shape == (2, 32, 48, 3)
+
+
+@pytest.mark.parametrize(
+    "change", [{"scale": (0.0, 1.0)}, {"scale": (2.0, 1.0)}, {"gaps": ()}, {"gaps": (0,)}, {"height": 8}]
+)
+def test_impossible_variation_is_refused(change: dict) -> None:
+    with pytest.raises(ValueError, match=r"expected|too small"):
+        VariationSettings(**change)
+
+
+def test_stream_of_pairs_resumes_exactly() -> None:
+    sources = [
+        PairSource(smooth_pictures(5, 64, 80), (1,)),
+        StackedPairs(smooth_pictures(6, 64, 80).reshape(3, 2, 64, 80, 3)),
+    ]
+    settings = VariationSettings(height=32, width=32)
+    stream = iter(pair_dataset(sources, (0.5, 0.5), settings, seed=3))
+    for _ in range(5):
+        next(stream)
+    place = stream.get_state()
+    ahead = [next(stream)["seen"] for _ in range(4)]
+    other = iter(pair_dataset(sources, (0.5, 0.5), settings, seed=3))
+    other.set_state(place)
+    for expected in ahead:
+        np.testing.assert_array_equal(next(other)["seen"], expected)
+    with pytest.raises(ValueError, match="positive share"):
+        pair_dataset(sources, (1.0,), settings, seed=0)
+
+
+# Drawn pairs
+
+
+def drawn(tmp_path: Path, **more) -> DrawnSettings:
+    pairs = FlowPairSettings(height=32, width=32, radius_px=(4.0, 12.0), motion_px=(0.1, 4.0), num_layers=(1, 2))
+    settings = {"num_pairs": 16, "num_validation": 16, "photographs": False, "folder": str(tmp_path), "pairs": pairs}
+    return DrawnSettings(**{**settings, **more})
+
+
+def test_drawn_pairs_are_made_once_and_follow_from_the_seed(tmp_path: Path) -> None:
+    one = drawn_pairs(drawn(tmp_path), progress=False)
+    assert one.shape == (16, 2, 32, 32, 3)
+    assert len(list(tmp_path.iterdir())) == 1
+    again = drawn_pairs(drawn(tmp_path), progress=False)
+    np.testing.assert_array_equal(one[:], again[:])
+    elsewhere = drawn_pairs(drawn(tmp_path / "other"), progress=False)
+    np.testing.assert_array_equal(one[:], elsewhere[:])
+    another = drawn_pairs(drawn(tmp_path, seed=1), progress=False)
+    assert np.any(another[:] != one[:])
+    held_out = validation_pairs(drawn(tmp_path))
+    assert not any(np.array_equal(np.asarray(held_out.first[i] * 255, np.uint8), one[0, 0]) for i in range(16))
+    with pytest.raises(ValueError, match="multiple of 16"):
+        drawn(tmp_path, num_pairs=10)
+
+
+# The update
+
+
+def batch(count: int = 2, seed: int = 0) -> list[dict[str, np.ndarray]]:
+    pictures = smooth_pictures(2 * count, 32, 32, seed).reshape(count, 2, 32, 32, 3)
+    return [{"clean": pair, "seen": pair} for pair in pictures]
+
+
+def test_step_learns_counts_and_skips_what_is_not_finite() -> None:
+    settings = FlowLossSettings(census_radius=1, census_stride=1)
+    optimizer = optax.adam(1e-3)
+    state = FlowTrainState.create(small_network(), optimizer, seed=0)
+    before = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state.network, eqx.is_array))]
+    state, numbers = flow_step(state, batch(), optimizer, settings, 10.0)
+    assert int(state.step) == 1
+    assert numbers["skipped"] == 0
+    after = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state.network, eqx.is_array))]
+    assert any(np.any(a != b) for a, b in zip(before, after, strict=True))
+    broken = eqx.tree_at(
+        lambda s: s.network.upsampler.bias,
+        state,
+        jnp.full_like(state.network.upsampler.bias, jnp.nan),  # pyright: ignore[reportAttributeAccessIssue]
+    )
+    kept = [np.asarray(leaf) for leaf in jax.tree.leaves(broken.optimizer_state)]
+    broken, numbers = flow_step(broken, batch(), optimizer, settings, 10.0)
+    assert numbers["skipped"] == 1
+    for a, b in zip(kept, jax.tree.leaves(broken.optimizer_state), strict=True):
+        np.testing.assert_array_equal(a, np.asarray(b))
+    with pytest.raises(ValueError, match="at least one pair"):
+        flow_step(state, [], optimizer, settings, 10.0)
+
+
+def test_average_of_the_weights_is_the_mean_at_first_and_a_running_one_later() -> None:
+    settings = FlowLossSettings(census_radius=1, census_stride=1)
+    optimizer = optax.sgd(0.1)
+    state = FlowTrainState.create(small_network(), optimizer, seed=0)
+    seen = []
+    for number in range(4):
+        state, _ = flow_step(state, batch(seed=number), optimizer, settings, 3.0)
+        seen.append(np.asarray(state.network.upsampler.weight, np.float64))  # pyright: ignore[reportAttributeAccessIssue]
+    expected = np.mean(seen[:3], axis=0)
+    expected = expected + (seen[3] - expected) / 3
+    average = state.average.upsampler.weight  # pyright: ignore[reportAttributeAccessIssue]
+    np.testing.assert_allclose(np.asarray(average), expected, atol=1e-7)
+
+
+class ShiftingNetwork(AbstractFlowNetwork):
+    """One pixel to the right towards the darker picture and back; in small pictures to the right both ways."""
+
+    shift_px: Float[Array, ""]
+    divisor: int = eqx.field(static=True)
+
+    def encode(self, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
+        return image
+
+    def decode(
+        self, first: Float[Array, "height width 3"], second: Float[Array, "height width 3"]
+    ) -> tuple[Float[Array, "_ _ 2"], ...]:
+        height, width, _ = first.shape
+        back = (jnp.mean(first) < jnp.mean(second)) & (height >= 32)
+        right = jnp.where(back, -self.shift_px, self.shift_px)
+        return (jnp.zeros((height, width, 2)).at[..., 0].set(right),)
+
+
+def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
+    settings = FlowLossSettings(census_radius=1, census_stride=1, occlusion_after=5)
+    network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
+    pictures = jnp.asarray(np.stack([sample["clean"][:, :31] for sample in batch()]), jnp.float32) / 255
+    shares = [
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings)[1]["hidden_share"])
+        for step in (4, 5)
+    ]
+    assert shares[0] == pytest.approx(1 / 32)  # what leaves the picture
+    assert shares[1] == 1.0
+
+
+def test_teacher_is_heard_late_and_then_ramped() -> None:
+    settings = FlowLossSettings(
+        census_radius=1, census_stride=1, self_supervision=1.0, self_supervision_after=10, self_supervision_ramp=10,
+        self_supervision_border_px=8,
+    )  # fmt: skip
+    dark = np.stack([sample["clean"] for sample in batch()]).astype(np.float32) / 255
+    pictures = jnp.asarray(dark * np.asarray([1.0, 0.5], np.float32).reshape(1, 2, 1, 1, 1))
+    network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
+    teaching = [
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings)[1]["teaching"])
+        for step in (10, 15, 20, 40)
+    ]
+    # Backward, the student is two pixels off in one of two axes where the teacher is sure; forward it is right.
+    np.testing.assert_allclose(teaching, [0.0, 0.5, 1.0, 1.0], atol=0.01)
+
+
+# Whole runs
+
+
+def configured(tmp_path: Path, **more) -> TrainFlowConfig:
+    values = {
+        "flow": SMALL,
+        "optimizer": {"_target_": "optax.adam", "learning_rate": 1e-3},
+        "average_over": 5,
+        "loss": {"census_radius": 1, "census_stride": 1, "occlusion_after": 2},
+        "data": {"variation": {"height": 32, "width": 32}},
+        "loop": {"num_steps": 5, "batch_size": 2, "checkpoint_every": 2, "validate_every": 5, "log_every": 1, "progress": False},
+        "logger": {"mode": "disabled"},
+        **more,
+    }  # fmt: skip
+    config = from_mapping(TrainFlowConfig, values)
+    return dataclasses.replace(config, data=dataclasses.replace(config.data, drawn=drawn(tmp_path / "drawn")))
+
+
+def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> None:
+    score = run_flow_training(configured(tmp_path), tmp_path / "run")
+    told = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert told["steps"] == 5
+    assert set(told["epe_px"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
+    np.testing.assert_allclose(score, told["epe_px"]["learned"]["all"])
+    assert (tmp_path / "run" / "weights.npz").is_file()
+
+
+def test_interrupted_run_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tagjax.training.flow_run as module
+
+    straight = configured(tmp_path)
+    run_flow_training(straight, tmp_path / "straight")
+    steps = {"done": 0}
+    real = module.flow_step
+
+    def interrupting(*arguments):
+        found = real(*arguments)
+        steps["done"] += 1
+        if steps["done"] == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return found
+
+    monkeypatch.setattr(module, "flow_step", interrupting)
+    assert np.isnan(run_flow_training(straight, tmp_path / "broken"))
+    monkeypatch.setattr(module, "flow_step", real)
+    run_flow_training(straight, tmp_path / "broken")
+    one, two = (_last_arrays(tmp_path / name) for name in ("straight", "broken"))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def _last_arrays(folder: Path) -> list[np.ndarray]:
+    like = FlowTrainState.create(
+        PyramidFlow(widths=(8, 8), radii=(1, 1), decoder_widths=((8,), (8,))),
+        optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3)),
+        seed=0,
+    )
+    with Checkpoints(folder / "checkpoints", create=False) as checkpoints:
+        state, _ = checkpoints.restore(like)
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
+
+
+def test_peers_and_scores_are_what_they_are_called(tmp_path: Path) -> None:
+    pairs = validation_pairs(drawn(tmp_path))
+    truth = np.asarray(pairs.forward_px)
+    assert scores(truth, pairs)["all"] == 0.0
+    zero = scores(flow_of_peer("zero", pairs), pairs)
+    np.testing.assert_allclose(zero["all"], np.mean(np.linalg.norm(truth, axis=-1)), rtol=1e-5)
+    assert scores(flow_of_peer("dis", pairs), pairs)["visible"] < zero["visible"]
+    assert flow_of(small_network(), pairs).shape == truth.shape
+
+
+def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="average_over"):
+        configured(tmp_path, average_over=0)
+    with pytest.raises(ConfigError, match="Nothing to learn from"):
+        configured(tmp_path, data={"drawn": {"num_pairs": 0}})
+    with pytest.raises(ValueError, match="is no network that learns"):
+        run_flow_training(configured(tmp_path, flow={"_target_": "tagjax.flow.opencv.DISFlow"}), tmp_path / "run")
+
+
+@pytest.fixture
+def drawn_stream(tmp_path: Path):
+    config = configured(tmp_path)
+    return iter(flow_dataset(config.data, seed=0, progress=False))
+
+
+def test_stream_without_sequences_is_drawn_only(drawn_stream) -> None:
+    assert next(drawn_stream)["clean"].shape == (2, 32, 32, 3)
