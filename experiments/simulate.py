@@ -3,6 +3,7 @@
 python -m experiments.simulate benchmark=multi_4
 python -m experiments.simulate benchmark=corpus benchmark.counts.train=200 out=recordings/corpus workers=8
 python -m experiments.simulate benchmark=crowd smoke=true out=recordings/smoke
+python -m experiments.simulate -m 'benchmark=glob(*)' sheet=docs/benchmark   # the pictures of docs/benchmark.md again
 """
 
 from __future__ import annotations
@@ -31,15 +32,19 @@ def main(config: DictConfig) -> None:
     from tagjax.config import SimulateConfig, from_mapping
     from tagjax.recording import RecordingError
     from tagjax.sim.suites import Suite, make_suite
-    from tagjax.viz.contact_sheet import save_sheet
+    from tagjax.viz.contact_sheet import save_glance, save_sheet
 
     values = resolved(config)
+    sheets = values.pop("sheet", None)
     if values.get("benchmark") is None:
         raise SystemExit("simulate: name a suite: benchmark=<name>. `--help` lists them.")
     checked = from_mapping(SimulateConfig, values)
     suite = from_mapping(Suite, checked.benchmark, where="benchmark")
     suite = suite.smoke() if checked.smoke else suite
     console = Console()
+    if sheets is not None:
+        console.print(f"{suite.name}: {save_glance(suite, Path(sheets), workers=checked.workers or 1)}")
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

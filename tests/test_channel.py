@@ -363,6 +363,48 @@ def test_every_tag_answers_once_a_round_in_changing_order():
     np.testing.assert_allclose(np.mean(np.diff(begins)), 17.3e-3 + 7 * 4.23e-3, rtol=0.02)
 
 
+def test_a_tag_out_of_reach_takes_no_slot():
+    """Six of seven tags go after 10 s: then the rounds are those of one tag; with none there is only the base."""
+    when = np.array([0.0, 10.0, 20.0])
+    present = np.ones((3, 7, 1), bool)
+    present[1, 1:] = False
+    present[2] = False
+    slots = draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), within_reach=(when, present))
+    assert set(slots.tag[slots.time_s > 10.1]) == {0}
+    assert slots.time_s.max() < 20.1
+    for low, high, num in ((0.0, 10.0, 7), (10.1, 20.0, 1)):
+        some = (slots.time_s > low) & (slots.time_s < high)
+        found = np.sum(some) / num / (high - low)
+        np.testing.assert_allclose(found, 1 / (17.3e-3 + num * 4.23e-3), rtol=0.04)
+    everybody = (np.zeros(1), np.ones((1, 7, 1), bool))
+    one, other = (draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), within_reach=w) for w in (None, everybody))
+    np.testing.assert_array_equal(one.time_s, other.time_s)
+
+
+def test_antennas_wait_only_for_tags_that_they_reach():
+    """A tag that only the second antenna reaches does not lengthen the first one's rounds."""
+    present = np.ones((1, 4, 2), bool)
+    present[0, 1:, 0] = False
+    slots = draw_schedule(0.0, 60.0, 4, np.random.default_rng(1), num_antennas=2, within_reach=(np.zeros(1), present))
+    assert set(slots.tag[slots.antenna == 0]) == {0}
+    assert set(slots.tag[slots.antenna == 1]) == {0, 1, 2, 3}
+    rounds = 60.0 / (2 * 17.3e-3 + 5 * 4.23e-3)
+    np.testing.assert_allclose(
+        [np.sum(slots.antenna == 0), np.sum(slots.antenna == 1)], [rounds, 4 * rounds], rtol=0.04
+    )
+
+
+def test_far_tags_leave_the_reader_to_near_ones():
+    """Eleven tags at 30 m are never heard; the one at 1 m is read as if it were alone."""
+    near, far = [[0.0, 0.0, 1.0]], [[0.5 * k, 0.0, 30.0] for k in range(11)]
+    counts = []
+    for positions in (near, near + far):
+        reads = simulate_inventory(still(positions, 30.0), AT_ORIGIN, free_space(), PLAIN, seed=0).reads
+        assert set(reads.epc) == {"E000"}
+        counts.append(reads.num_reads)
+    np.testing.assert_allclose(counts[1], counts[0], rtol=0.03)
+
+
 @pytest.fixture(scope="module")
 def static_by_rssi():
     """Still tags in free space, one for each RSSI, on one channel."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 from pathlib import Path
 
@@ -15,9 +16,15 @@ import yaml
 from tagjax.config import ConfigError, from_mapping
 from tagjax.data.store import open_recording
 from tagjax.recording import RecordingError
+from tagjax.sim.objects import bounds
 from tagjax.sim.planar import PlanarSettings, open_planar, planar_trials
+from tagjax.sim.raycast import Stage, look_at
+from tagjax.sim.record import film
+from tagjax.sim.sensors import kinect_v2_intrinsics
 from tagjax.sim.stories import STORIES
 from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, make_suite, prepare, stage_item
+from tagjax.sim.visibility import seen_share, steps_every, stretches
+from tagjax.sim.world import STEP_S
 from tagjax.viz.contact_sheet import save_sheet
 
 FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
@@ -30,7 +37,7 @@ def _suite(path: Path) -> Suite:
 def _tiny(**changed) -> Suite:
     variants = (Variant("one", {"num_objects": 1}), Variant("two", {"num_objects": 2}))
     suite = Suite("tiny", "a test", "none", "tabletop", 5, variants=variants).smoke()
-    return dataclasses.replace(suite, duration_s=0.8, **changed)
+    return dataclasses.replace(suite, **{"duration_s": 0.8, **changed})
 
 
 def _digest(folder: Path) -> dict[str, str]:
@@ -70,14 +77,189 @@ def test_no_two_recordings_share_a_seed():
     assert {item.split for path in FILES for item in _suite(path).items()} == set(SPLITS)
 
 
+def _named(name: str) -> Suite:
+    return _suite(FILES[0].parent / f"{name}.yaml")
+
+
+def _view(filmed, suite: Suite):
+    return look_at(suite.capture.intrinsics(), filmed.camera_position_m, filmed.camera_look_at_m)
+
+
+def _bodies(filmed) -> dict[str, list[int]]:
+    """Numbers of each person's limbs."""
+    found: dict[str, list[int]] = {}
+    for number, body in enumerate(filmed.world.bodies):
+        if body.role == "person":
+            found.setdefault(body.name, []).append(number)
+    return found
+
+
+def _speed(path_m: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.diff(path_m, axis=0), axis=1) / STEP_S
+
+
+def test_every_train_leaves_as_many_traces_as_its_variant_says():
+    """All items: stretches in which any point of the train is in the picture and in sight, among all bodies."""
+    suite = _named("separated_traces")
+    assert {variant.settings["num_traces"] for variant in suite.variants} == {2, 3, 4}
+    for item in suite.items():
+        filmed = stage_item(item)
+        looks = steps_every(filmed.world, 0.2)
+        for tag in filmed.world.tags:
+            seen = seen_share(filmed.world, (tag.body,), _view(filmed, suite), looks) > 0
+            shown, hidden = stretches(seen), stretches(~seen)
+            assert len(shown) == item.variant.settings["num_traces"], item.name
+            assert seen[0]
+            assert seen[-1]
+            assert np.diff(shown).min() >= 2, item.name
+            assert np.diff(hidden).min() >= 1, item.name
+
+
+@pytest.mark.parametrize("variant", ["two", "four"])
+def test_the_masks_of_a_film_come_and_go_as_often(variant):
+    suite = _named("separated_traces")
+    item = next(item for item in suite.items() if item.split == "test" and item.variant.name == variant)
+    filmed = stage_item(item)
+    capture = dataclasses.replace(suite.capture, width=96, frame_rate_hz=8.0)
+    truth = film(filmed, capture, seed=item.seed, name=item.name).truth
+    assert truth is not None
+    for label in (1, 2):
+        shown = np.any(np.asarray(truth.labels) == label, axis=(1, 2))
+        assert len(stretches(shown)) == item.variant.settings["num_traces"]
+        np.testing.assert_array_equal(shown, truth.visible[label])
+
+
+def test_everybody_comes_in_and_leaves():
+    """All items: no limb, no object is in the picture at either end; each person walks about in it between."""
+    suite = _named("enter_leave")
+    for item in suite.items():
+        filmed = stage_item(item)
+        world, view, looks = filmed.world, _view(filmed, suite), steps_every(filmed.world, 0.3)
+        people = _bodies(filmed)
+        assert len(people) == len(world.tags) == suite.settings["num_people"]
+        for limbs, tag in zip(people.values(), world.tags, strict=True):
+            seen = seen_share(world, (*limbs, tag.body), view, looks) > 0
+            assert not seen[:2].any(), item.name
+            assert not seen[-2:].any(), item.name
+            assert seen.sum() * 0.3 > 3.0, item.name
+            # Behind the wall at both ends, well before it between, through the opening each time.
+            hips = world.bodies[limbs[0]].poses.position_m
+            wall = next(body for body in world.bodies if body.name == "lintel")
+            wall_m, opening_m = wall.poses.position_m[0], wall.shapes[0].size_m[1]
+            ahead = hips[:, 0] < wall_m[0]
+            assert not ahead[0]
+            assert not ahead[-1]
+            assert hips[:, 0].min() < wall_m[0] - 1.0
+            crossings = np.flatnonzero(np.diff(ahead.astype(int)))
+            assert len(crossings) == 2, item.name
+            assert np.abs(hips[crossings, 1] - wall_m[1]).max() < opening_m - 0.2
+        apart = [np.linalg.norm(world.bodies[a[0]].poses.position_m - world.bodies[b[0]].poses.position_m, axis=1)
+                 for a, b in itertools.combinations(people.values(), 2)]  # fmt: skip
+        assert min(gap.min() for gap in apart) > 0.5
+
+
+def test_a_film_of_a_door_starts_and_ends_empty():
+    suite = _named("enter_leave")
+    item = next(item for item in suite.items() if item.split == "test")
+    filmed = stage_item(item)
+    stage = Stage(filmed.world)
+    view = look_at(kinect_v2_intrinsics(96), filmed.camera_position_m, filmed.camera_look_at_m)
+    roles = np.array([filmed.world.bodies[body].role for body in stage.geom_body])
+
+    def shown(step: float) -> int:
+        stage.pose(step)
+        return int(np.sum(np.isin(roles[np.maximum(stage.cast(view).geom, 0)], ("person", "object"))))
+
+    last = filmed.world.num_steps - 1
+    assert [shown(0), shown(25), shown(last - 25), shown(last)] == [0, 0, 0, 0]
+    assert shown(last // 2) > 50
+
+
+@pytest.mark.parametrize(("name", "variant"), [("planar_tracks", "three"), ("shop_exit", "sp_mt_4")])
+def test_things_do_not_pass_through_each_other(name, variant):
+    """All items: the boxes round two things, turned with them but taken as upright, never overlap."""
+    for item in _named(name).items():
+        if item.variant.name != variant:
+            continue
+        filmed = stage_item(item)
+        things = [filmed.world.bodies[tag.body] for tag in filmed.world.tags]
+        for one, other in itertools.combinations(things, 2):
+            (low, high), (bottom, top) = bounds(one.shapes), bounds(other.shapes)
+            between = one.poses.position_m - other.poses.position_m
+            across = (
+                np.linalg.norm(between[:, :2], axis=1) - 0.5 * (high - low)[:2].min() - 0.5 * (top - bottom)[:2].min()
+            )
+            above = np.abs(between[:, 2]) - 0.5 * (high - low)[2] - 0.5 * (top - bottom)[2]
+            assert np.maximum(across, above).min() > 0, (item.name, one.name, other.name)
+
+
+def test_people_walk_as_fast_as_the_suite_says():
+    """All items: the asked speed is reached on the legs and kept there, and the object is never much faster."""
+    for item in (suite := _named("speed")).items():
+        filmed = stage_item(item)
+        asked = item.variant.settings["speed_m_s"]
+        walker = _speed(filmed.world.bodies[next(iter(_bodies(filmed).values()))[0]].poses.position_m[:, :2])
+        carried = filmed.world.bodies[filmed.world.tags[0].body].poses.position_m
+        assert walker.max() == pytest.approx(asked, rel=0.02), item.name
+        assert np.mean(walker > 0.95 * asked) > 0.15, item.name
+        assert np.percentile(walker, 75) > 0.75 * asked, item.name
+        assert _speed(carried).max() < 1.06 * asked, item.name
+        # Both ways: towards the sensor and away.
+        rate = np.diff(np.linalg.norm(carried - np.array(filmed.camera_position_m), axis=1)) / STEP_S
+        assert rate.min() < -0.7 * asked, item.name
+        assert rate.max() > 0.6 * asked or suite.duration_s * asked < 3.5, item.name
+
+
+def test_hands_wave_as_fast_as_the_suite_says():
+    """All items: at rest for 2 s, then a peak of exactly the asked speed within the push that it needs."""
+    suite = _named("velocity_threshold")
+    assert sorted(variant.settings["speed_m_s"] for variant in suite.variants) == [0.5, 2.5]
+    for item in suite.items():
+        filmed = stage_item(item)
+        path = filmed.world.bodies[filmed.world.tags[0].body].poses.position_m
+        asked, speed = item.variant.settings["speed_m_s"], _speed(path)
+        assert speed[: round(1.9 / STEP_S)].max() < 0.05, item.name
+        assert speed.max() == pytest.approx(asked, rel=0.03), item.name
+        push = np.linalg.norm(np.diff(path, n=2, axis=0), axis=1).max() / STEP_S**2
+        assert push < 1.1 * max(12.0, 5.5 * asked**2), item.name
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_suite_finds_room_for_its_story(path):
     suite = _suite(path)
     if suite.story == PLANAR:
         return
-    suite = dataclasses.replace(suite, duration_s=min(suite.duration_s, 5.0), counts=Counts(0, 0, 1))
+    shorter_s = min(suite.duration_s, max(5.0, suite.smoke_s))
+    suite = dataclasses.replace(suite, duration_s=shorter_s, counts=Counts(0, 0, 1))
     for item in suite.items():
         stage_item(item).world.check()
+
+
+def test_a_glance_shows_the_worlds_of_the_suite():
+    suite = _named("velocity_threshold")
+    glance = suite.glance()
+    first = [item for item in suite.items() if item.split == "test" and item.number == 0]
+    assert [(item.name, item.seed) for item in glance.items()] == [(item.name, item.seed) for item in first]
+    recording = film(stage_item(glance.items()[0]), dataclasses.replace(glance.capture, width=32), seed=1, name="x")
+    assert recording.num_frames == 6
+    assert [item.split for item in _named("corpus").glance().items()] == ["train"] * 10
+
+
+def test_readers_and_stories_differ_by_variant():
+    suite = _tiny(
+        duration_s=2.0,
+        reader={"region": "china", "flip_share": 0.0},
+        variants=(
+            Variant("one", {"num_objects": 1}),
+            Variant("two", {"num_objects": 2}, reader={"flip_share": 0.12}),
+            Variant("hand", {"still_s": 0.2}, story="handheld"),
+        ),
+    )
+    one, two, hand = (stage_item(item) for item in suite.items())
+    assert [filmed.inventory.flip_share for filmed in (one, two, hand)] == [0.0, 0.12, 0.0]
+    assert {filmed.inventory.region for filmed in (one, two, hand)} == {"china"}
+    assert not any(body.role == "person" for body in two.world.bodies)
+    assert any(body.role == "person" for body in hand.world.bodies)
 
 
 def test_a_killed_run_goes_on_and_repeats_exactly(tmp_path):
@@ -146,6 +328,12 @@ def test_impossible_suites_are_refused():
         from_mapping(Suite, given)
     with pytest.raises(ConfigError, match="duration_s is 0"):
         from_mapping(Suite, {**given, "story": "handheld", "duration_s": 0.0})
+    with pytest.raises(ConfigError, match="smoke_s 0"):
+        from_mapping(Suite, {**given, "story": "handheld", "smoke_s": 0.0})
+    with pytest.raises(ConfigError, match="unknown reader setting volume; known are clock_drift_ppm"):
+        from_mapping(Suite, {**given, "story": "handheld", "reader": {"volume": 3}})
+    with pytest.raises(ConfigError, match="unknown story 'juggle'"):
+        from_mapping(Suite, {**given, "story": "handheld", "variants": [{"name": "a", "story": "juggle"}]})
     with pytest.raises(ConfigError, match="unknown key 'durations'"):
         from_mapping(Suite, {**given, "durations": 3})
     full = Suite("x", "x", "x", "tabletop", 1, settings={"num_objects": 40}, counts=Counts(0, 0, 1))

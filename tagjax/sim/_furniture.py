@@ -104,8 +104,46 @@ def walls(plan: Plan, rng: np.random.Generator, size) -> None:
     ]
 
 
+def doorway(
+    plan: Plan, rng: np.random.Generator, size, x: float, y: float, *, wide: float = 1.1, tall: float = 2.05
+) -> None:
+    """A wall across a room at `x` with an opening about `y`, its frame and open leaf; a dark corridor lies behind it.
+
+    The corridor reaches from the wall to the far end of the room, over its whole width.
+    """
+    length, width, height = size
+    w, thick, hinge = width / 2, 0.1, 1.0 if y < 0 else -1.0
+    wall = surface(rng, 0.45, 0.85, scale=float(rng.uniform(1, 3)), reflection=WALL_REFLECTION, transmission_db=6.0)
+    wood = surface(rng, 0.15, 0.45, texture="stripes", scale=25.0, contrast=0.2, transmission_db=3.0)
+    gloom = surface(rng, 0.04, 0.1, texture="noise", transmission_db=12.0, reflection=WALL_REFLECTION)
+    for low, high in ((-w, y - wide / 2), (y + wide / 2, w)):
+        plan.block("partition", (x, low, 0), (x + thick, high, height), wall)
+        middle, half = (low + high) / 2, (high - low) / 2
+        panel = Panel((x, middle, height / 2), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (half, height / 2), WALL_REFLECTION)
+        plan.panels.append(panel)
+    plan.block("lintel", (x, y - wide / 2, tall), (x + thick, y + wide / 2, height), wall, solid=False)
+    trim = 0.05
+    for side in (-1, 1):
+        low, high = sorted((y + side * wide / 2, y + side * (wide / 2 + trim)))
+        plan.block("door frame", (x - 0.015, low, 0), (x, high, tall + trim), wood, solid=False)
+    low, high = y - wide / 2, y + wide / 2
+    plan.block("door frame", (x - 0.015, low, tall), (x, high, tall + trim), wood, solid=False)
+    # The leaf stands open, flat against the wall.
+    low, high = sorted((y + hinge * (wide / 2 + trim), y + hinge * (1.5 * wide + trim)))
+    plan.block("door leaf", (x - 0.055, low, 0.01), (x - 0.015, high, tall), wood, "furniture")
+    end = y + hinge * (1.5 * wide + trim - 0.08)
+    steel = Material((0.5, 0.5, 0.52), "plain", contrast=0.05, shine=0.6, transmission_db=2.0)
+    plan.block("handle", (x - 0.11, end - 0.06, 1.0), (x - 0.055, end + 0.06, 1.03), steel, "furniture", solid=False)
+    for name, lowest, highest in (
+        ("corridor wall", (length - 0.02, -w, 0), (length, w, height)),
+        ("corridor floor", (x + thick, -w, 0), (length, w, 0.004)),
+        ("corridor ceiling", (x + thick, -w, height - 0.02), (length, w, height)),
+    ):
+        plan.block(name, lowest, highest, gloom, solid=False)
+
+
 def pictures(plan: Plan, rng: np.random.Generator, size, num: int) -> None:
-    """Flat pictures on the far wall and the sides, for texture above the furniture."""
+    """Flat pictures on the far wall and the sides, for texture above the furniture; a third of them a photograph."""
     length, width, _ = size
     for _ in range(num):
         a, b, z = rng.uniform(0.2, 0.6), rng.uniform(0.15, 0.4), rng.uniform(1.4, 1.8)
@@ -117,6 +155,8 @@ def pictures(plan: Plan, rng: np.random.Generator, size, num: int) -> None:
             scale=float(rng.uniform(4, 14)),
             contrast=float(rng.uniform(0.4, 0.8)),
         )
+        if skin.seed % 3 == 0:
+            skin = dataclasses.replace(skin, texture="photo", photo="hopper", scale=2 * a, contrast=0.95, seed=0)
         if rng.random() < 0.5:
             y = rng.uniform(-width / 2 + 0.7, width / 2 - 0.7)
             plan.block("picture", (length - 0.02, y - a, z - b), (length, y + a, z + b), skin, solid=False)

@@ -19,10 +19,13 @@ from ._stage_set import (
 )
 from .motion import Walk, smooth_step
 from .objects import ObjectModel, make_object
-from .people import Hands, carried, hold, make_person
+from .people import Hands, PersonModel, carried, hold, make_person, move_person
 from .record import Filmed
 from .rooms import make_room
 from .world import STEP_S, Body, Material, Poses, Shape, rotation_matrix
+
+_DRAWS = 8  # of waves within reach of the arms
+_NEAR_M = 5.0  # still tags farther away are hardly read
 
 
 def handheld(
@@ -60,11 +63,16 @@ def handheld(
         facing = facing_towards(place, camera) + float(rng.uniform(-0.2, 0.2))
         walk = standing(place, facing, stage.steps)
         mine = models if one_grip else models[2 * number : 2 * number + 2]
-        right = waved_hand(walk, -1, rng, duration_s, speed_m_s, still_s)
-        left = waved_hand(walk, 1, rng, duration_s, speed_m_s, still_s) if len(mine) > 1 and not one_grip else None
-        if passing:
-            left = _before(walk, right, camera, duration_s)
-        person, hands = make_person(rng), Hands(left=left, right=right)
+        sides = (-1, 1) if len(mine) > 1 and not one_grip else (-1,)
+        waves = [waved_hand(walk, side, rng, duration_s, speed_m_s, still_s) for side in sides]
+        person = make_person(rng)
+        for _ in range(_DRAWS):
+            # An arm that is too short stops its hand short of the wave, with a jerk.
+            if _reaches(person, walk, waves):
+                break
+            waves = [waved_hand(walk, side, rng, duration_s, speed_m_s, still_s) for side in sides]
+        left = _before(walk, waves[0], camera, duration_s) if passing else (waves[1] if len(waves) > 1 else None)
+        hands = Hands(left=left, right=waves[0])
         motion = stage.person(person, walk, hands)
         if one_grip:
             _together(stage, mine, motion.right_hand)
@@ -75,9 +83,16 @@ def handheld(
             notebook = make_object("notebook", rng, scale=1.25)
             stage.object(notebook, _upright_sheet(notebook, motion.left_hand, camera), tagged=False)
     add_walkers(stage, rng, num_walkers, duration_s, places)
-    add_still_tags(stage, rng, num_still_tags)
+    add_still_tags(stage, rng, num_still_tags, within_m=_NEAR_M)
     middle = np.mean(places, axis=0)
     return stage.filmed("people wave objects", look_at_m=(middle[0], 0.8 * middle[1], 1.1), num_antennas=num_antennas)
+
+
+def _reaches(person: PersonModel, walk: Walk, waves: Sequence[np.ndarray]) -> bool:
+    """Whether the right hand, and the left if it has a wave, keep to their waves, to 2 mm."""
+    motion = move_person(person, walk, Hands(right=waves[0], left=waves[1] if len(waves) > 1 else None))
+    hands = (motion.right_hand, motion.left_hand)
+    return all(np.abs(wave - hand.position_m).max() < 0.002 for wave, hand in zip(waves, hands, strict=False))
 
 
 def _together(stage: StageSet, models: Sequence[ObjectModel], hand: Poses) -> None:

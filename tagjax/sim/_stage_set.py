@@ -80,6 +80,7 @@ class StageSet:
             room.antennas_m[:num_antennas],
             room.panels,
             InventorySettings(**inventory),
+            None if room.antenna_axes is None else room.antenna_axes[:num_antennas],
         )
 
 
@@ -167,15 +168,30 @@ def trimmed(walk: Walk, steps: int) -> Walk:
     return Walk(*(getattr(walk, field.name)[index] for field in dataclasses.fields(walk)))
 
 
-def add_still_tags(stage: StageSet, rng: np.random.Generator, count: int) -> None:
-    """Small tagged things that lie on tables, shelves and the floor; they are not labelled."""
-    tables = stage.room.tables
+def add_still_tags(stage: StageSet, rng: np.random.Generator, count: int, *, within_m: float = np.inf) -> None:
+    """Small tagged things that lie on tables, shelves and the floor; they are not labelled.
+
+    Each at the first of a few places that is `within_m` from the first antenna, or at the last of them.
+    """
+    antenna = np.array(stage.room.antennas_m[0])
     for _ in range(count):
         model = make_object(str(rng.choice(["book", "mug", "box"])), rng, scale=0.8)
-        if tables and rng.random() < 0.8:
-            table = tables[int(rng.integers(len(tables)))]
-            x0, y0, x1, y1 = table.top_m
-            place = (rng.uniform(x0 + 0.05, x1 - 0.05), rng.uniform(y0 + 0.05, y1 - 0.05), table.height_m)
-        else:
-            place = (*stage.room.free_place(rng), 0.0)
+        place = _resting_place(stage.room, rng)
+        for _ in range(_PLACES):
+            if np.linalg.norm(np.array(place) - antenna) <= within_m:
+                break
+            place = _resting_place(stage.room, rng)
         stage.object(model, resting(model, place, rng.uniform(0, 2 * np.pi)), labelled=False)
+
+
+_PLACES = 30
+
+
+def _resting_place(room: Room, rng: np.random.Generator) -> tuple[float, float, float]:
+    """On a table or a shelf, mostly, or on the floor."""
+    tables = room.tables
+    if tables and rng.random() < 0.8:
+        table = tables[int(rng.integers(len(tables)))]
+        x0, y0, x1, y1 = table.top_m
+        return rng.uniform(x0 + 0.05, x1 - 0.05), rng.uniform(y0 + 0.05, y1 - 0.05), table.height_m
+    return (*room.free_place(rng), 0.0)

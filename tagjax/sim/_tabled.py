@@ -13,11 +13,12 @@ from ._stage_set import (
     StageSet,
     fitted,
 )
+from ._tunnels import tunnels
 from .motion import path_through
 from .objects import make_object
 from .record import Filmed
 from .rooms import make_room
-from .world import STEP_S, Body, Material, Poses, Shape
+from .world import STEP_S, Poses
 
 
 def tabletop(
@@ -28,15 +29,15 @@ def tabletop(
     kind: str = "train",
     speed_m_s: Sequence[float] = (0.25, 0.5),
     tracks: str = "loops",
-    num_tunnels: int = 0,
+    num_traces: int = 1,
     spacing_m: float = 0.164,
     antenna: str = "ceiling",
 ) -> Filmed:
     """Toy trains on a table top of 1.5 x 3 m, seen from the ceiling.
 
     `tracks`: "loops" (rounded closed tracks, one each), "parallel" (straight lines `spacing_m` apart, the same motion),
-    "curves" (open curves over the table). Trains disappear under `num_tunnels` for a while. `antenna`: "ceiling"
-    beside the camera, or "side", at the table's edge and height.
+    "curves" (open curves over the table). Tunnels hide every train so that the camera sees it `num_traces` times, each
+    a stretch of its own. `antenna`: "ceiling" beside the camera, or "side", at the table's edge and height.
     """
     if tracks not in ("loops", "parallel", "curves"):
         raise ValueError(f"tracks is {tracks!r}; expected loops, parallel or curves.")
@@ -52,13 +53,9 @@ def tabletop(
         yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
         z = np.full(stage.steps, table.height_m + model.half_size_m[2])
         stage.object(model, Poses(np.column_stack([line, z]), turn_about(UP, yaw)))
-    roof = Material((0.35, 0.3, 0.28), "speckle", 30.0, 0.3, transmission_db=1.0)
-    for number in range(num_tunnels):
-        line = lines[number % len(lines)]
-        x, y = line[int(rng.uniform(0.3, 0.7) * len(line))]
-        size = (0.14, 0.16, 0.006)
-        shape = Shape("box", size, roof)
-        stage.bodies.append(Body("tunnel", (shape,), Poses.fixed((x, y, table.height_m + 0.2)), "furniture"))
+    if num_traces != 1:
+        trains = [stage.bodies[tag.body] for tag in stage.tags]
+        stage.bodies += tunnels(trains, table, num_traces, stage.room.camera_position_m, stage.steps, rng)
     filmed = stage.filmed(f"{num_objects} trains on {tracks}")
     if antenna == "side":
         place = (table.top_m[2] + 0.4, float(rng.uniform(-0.4, 0.4)), table.height_m + 0.1)
@@ -92,11 +89,26 @@ def _track_lines(kind, count, top_m, time_s, rng, speed_m_s, spacing_m) -> list[
             lines.append(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
         else:
             low, high = np.array([x0 + 0.15, y0 + 0.15]), np.array([x1 - 0.15, y1 - 0.15])
-            points = [np.array([*rng.uniform(low, high), 0.0])]
-            while len(points) < 12:
-                point = np.array([*rng.uniform(low, high), 0.0])
-                if np.linalg.norm(point - points[-1]) > 0.5:
-                    points.append(point)
-            path = path_through(points, speed_m_s=rng.uniform(*speed_m_s), max_acceleration_m_s2=1.0)[:, :2]
-            lines.append(np.clip(fitted(path, len(time_s)), low - 0.1, high + 0.1))
+            for _ in range(_TRIES):
+                path = _curve(low, high, len(time_s), rng, speed_m_s)
+                if all(np.linalg.norm(path - other, axis=1).min() >= _APART_M for other in lines):
+                    lines.append(path)
+                    break
+            else:
+                raise ValueError(f"{count} curves do not keep {_APART_M} m apart on the table; ask for fewer.")
     return lines
+
+
+_TRIES = 100
+_APART_M = 0.27  # between the middles of two things: no ball is wider
+
+
+def _curve(low: np.ndarray, high: np.ndarray, steps: int, rng, speed_m_s) -> np.ndarray:
+    """A path (steps, 2) through random points of a rectangle."""
+    points = [np.array([*rng.uniform(low, high), 0.0])]
+    while len(points) < 12:
+        point = np.array([*rng.uniform(low, high), 0.0])
+        if np.linalg.norm(point - points[-1]) > 0.5:
+            points.append(point)
+    path = path_through(points, speed_m_s=rng.uniform(*speed_m_s), max_acceleration_m_s2=1.0)[:, :2]
+    return np.clip(fitted(path, steps), low - 0.1, high + 0.1)

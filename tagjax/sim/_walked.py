@@ -6,20 +6,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ._crowd import is_free
 from ._stage_set import (
     StageSet,
     add_still_tags,
     ease,
     fitted,
-    is_clear,
     trimmed,
     waved_hand,
 )
 from .motion import num_steps, path_through, random_walks, still_then_move, walk_along
-from .objects import make_object
+from .objects import ObjectModel, make_object
 from .people import Hands, carried, hold, make_person
 from .record import Filmed
-from .rooms import make_room
+from .rooms import Room, make_room
 from .world import Poses
 
 KINDS = ("bottle", "box", "toy", "notebook", "bag")
@@ -34,28 +34,55 @@ def approach(
     kind: str = "bag",
     speed_m_s: float = 0.8,
 ) -> Filmed:
-    """A person walks towards the sensor and away again, to and fro, at a speed, an object in the right hand."""
+    """A person walks towards the sensor and away again, round and round, an object in the right hand.
+
+    Straight legs are walked at `speed_m_s` once it is reached; the narrow turns at the ends, to the right, are slower,
+    and the object, on their inner side, never moves faster than the person does on the legs.
+    """
     stage = StageSet(make_room(room, rng), duration_s)
-    area = stage.room.walk_area_m
-    camera = np.array(stage.room.camera_position_m)
-    for _ in range(500):
-        y = rng.uniform(area[1] + 0.3, area[3] - 0.3) * 0.6
-        near = max(camera[0] + 1.5, area[0] - 0.1)
-        far = min(area[2], near + rng.uniform(1.6, 2.9))
-        line = np.linspace(near, far, 20)
-        if all(is_clear(stage.room, (x, y)) for x in line):
-            break
-    else:
-        raise ValueError(f"No free line towards the camera in the {stage.room.name}; try another seed.")
-    turns = max(2, int(np.ceil(speed_m_s * duration_s / (far - near))) + 2)
-    ends = [(far if k % 2 == 0 else near, y + (0.12 if k % 2 else 0.0), 0.0) for k in range(turns)]
-    path = path_through(ends, speed_m_s=speed_m_s, max_acceleration_m_s2=3.0)
+    # Slow enough in the turns that the object, which is farther from their middle than the person, is not the faster.
+    push = min(3.0, 2.8 * speed_m_s**2)
+    # Speeding up and braking take a length; a leg is longer by what is walked in 0.3 s.
+    least = 1.2 * speed_m_s**2 / push + 0.3 * speed_m_s + 2 * _TURN_M
+    near, far, y = _lane(stage.room, rng, max(least, 1.8))
+    laps = int(np.ceil(speed_m_s * duration_s / (2 * (far - near)))) + 1
+    path = path_through(_loops(near, far, y, laps), speed_m_s=speed_m_s, max_acceleration_m_s2=push)
     walk = trimmed(walk_along(path), stage.steps)
     person, model = make_person(rng), make_object(kind, rng)
-    hands = Hands(right=hold(walk, (0.25, -0.3, 1.0)))
-    motion = stage.person(person, walk, hands)
+    motion = stage.person(person, walk, Hands(right=hold(walk, (0.26, -0.16, 1.0))))
     stage.object(model, carried(motion.right_hand, model.grip_m))
     return stage.filmed(f"a person walks to and fro at {speed_m_s} m/s", look_at_m=((near + far) / 2, 0.5 * y, 0.95))
+
+
+_TURN_M = 0.25  # radius of the turn at the ends
+
+
+def _lane(room: Room, rng: np.random.Generator, least_m: float) -> tuple[float, float, float]:
+    """Near end, far end and middle (x, x, y) of a free lane towards the camera, at least so long."""
+    _, y0, x1, y1 = room.walk_area_m
+    camera = room.camera_position_m
+    near = camera[0] + 1.4
+    for _ in range(500):
+        far = near + rng.uniform(least_m, max(least_m, 2.9))
+        y = camera[1] + rng.uniform(-0.8, 0.8)
+        places = [(x, y + side * _TURN_M) for x in np.linspace(near, far, 20) for side in (-1, 1)]
+        if all(is_free(np.array(place), (near, y0, x1, y1), room.obstacles_m, 0.33) for place in places):
+            return near, float(far), float(y)
+    raise ValueError(f"No free lane of {least_m:.1f} m towards the camera in the {room.name}; try another seed.")
+
+
+def _loops(near: float, far: float, y: float, laps: int) -> np.ndarray:
+    """Points (points, 3) of a narrow loop, walked clockwise from its far end: in at y - r, back at y + r."""
+    r = _TURN_M
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 7)
+    legs = np.linspace(far - r, near + r, max(3, round((far - near) / 0.4)))
+    out = []
+    for _ in range(laps):
+        out += [(x, y - r) for x in legs[:-1]]
+        out += [(near + r - r * np.cos(a), y + r * np.sin(a)) for a in turn]
+        out += [(x, y + r) for x in legs[::-1][1:-1]]
+        out += [(far - r + r * np.cos(a), y - r * np.sin(a)) for a in turn[:-1]]
+    return np.column_stack([np.array(out), np.zeros(len(out))])
 
 
 def crowd(
@@ -106,6 +133,8 @@ def shop_exit(
     stay_share: float = 0.5,
 ) -> Filmed:
     """People with tagged things walk about a shop of 3 x 7 m; each leaves through the exit, or stays (`stay_share`)."""
+    if not 1 <= tags_each <= 4:
+        raise ValueError(f"tags_each is {tags_each}; two hands carry 1 to 4 things.")
     stage = StageSet(make_room("shop_floor", rng), duration_s)
     room = stage.room
     x0, _, x1, _ = room.walk_area_m
@@ -123,16 +152,25 @@ def shop_exit(
             right=hold(walk, (0.2, -0.28, 0.95)), left=hold(walk, (0.2, 0.28, 0.95)) if tags_each > 1 else None
         )
         motion = stage.person(person, walk, hands)
+        held: list[ObjectModel] = []
         for number in range(tags_each):
             model = make_object(str(rng.choice(["bag", "box", "bottle", "toy"])), rng, scale=0.8)
             hand = (motion.right_hand, motion.left_hand)[number % 2]
             pose = carried(hand, model.grip_m)
-            lift = 0.22 * (number // 2)
+            lift = _lift(held[number - 2], model) if number > 1 else 0.0
             stage.object(model, Poses(pose.position_m + np.array([0.0, 0.0, lift]), pose.quaternion))
+            held.append(model)
     add_still_tags(stage, rng, num_still_tags)
     return stage.filmed(
         f"{num_people} people, {tags_each} tags each, {num_still_tags} still", num_antennas=3, rounds_per_antenna=2
     )
+
+
+def _lift(first: ObjectModel, second: ObjectModel) -> float:
+    """Height to add to the second object of a hand, so that it is just above or below the first."""
+    room = first.half_size_m[2] + second.half_size_m[2] + 0.01
+    grips = second.grip_m[2] - first.grip_m[2]
+    return min(grips + room, grips - room, key=abs)
 
 
 def grid(

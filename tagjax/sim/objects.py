@@ -139,7 +139,7 @@ def _box(rng: np.random.Generator) -> _Draft:
 
 def _bottle(rng: np.random.Generator) -> _Draft:
     r, half = rng.uniform(0.032, 0.045), rng.uniform(0.075, 0.11)
-    # Water: about 3 dB one way through a few centimetres, and a good mirror.
+    # Water: a good mirror; its loss is assumed.
     liquid = dataclasses.replace(_surface(rng, fine=1.5), transmission_db=float(rng.uniform(6, 10)), reflection=-0.5)
     label, cap = _surface(rng, loss_db=0.5, fine=2.0), _plain(_colour(rng))
     shoulder = _part("ellipsoid", (r, r, 0.8 * r), (0, 0, half), liquid)

@@ -115,6 +115,7 @@ class Stage:
         self.geom_shape: tuple[Shape, ...] = tuple(shape for _, shape in found)
         self.geom_label = np.array([world.bodies[body].label for body, _ in found], np.uint8)
         self.geom_moves = np.array([world.bodies[body].poses.moves for body, _ in found], bool)
+        self._spheres = _bounding_spheres(self.model)
         self._paths = [(body.poses.position_m, body.poses.quaternion) for body in movers]
         self._views: dict[tuple, tuple[np.ndarray, Hits]] = {}
         self._lit: dict[tuple, np.ndarray] = {}
@@ -287,12 +288,42 @@ class Stage:
         ray = hits.world_m.reshape(-1, 3)[pixels] - light
         # What faces away from the light is dark without a ray: half of most pictures' movers.
         faces = (own >= 0) & (np.einsum("ni,ni->n", ray, hits.normal.reshape(-1, 3)[pixels]) < 0)
+        faces = np.flatnonzero(faces)
         ray = ray[faces]
         away = np.maximum(np.sqrt(np.einsum("ni,ni->n", ray, ray)), 1e-9)
-        geom, distance, _ = self._shoot(light, ray / away[:, None], group)
+        ray /= away[:, None]
+        if group is _MOVING:
+            near = np.flatnonzero(self._may_meet_movers(light, ray))
+            faces, ray, away = faces[near], ray[near], away[near]
+        geom, distance, _ = self._shoot(light, ray, group)
         shaded = np.zeros(len(pixels), bool)
         shaded[faces] = (geom >= 0) & (distance < away - _SHADOW_GAP_M)
         return shaded
+
+    def _may_meet_movers(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Which unit rays (n, 3) from a place pass the bounding sphere of a moving body: a look that is cheaper than a cast."""
+        body, centre, radius = self._spheres
+        turn = self.data.xmat.reshape(-1, 3, 3)[body]
+        toward = self.data.xpos[body] + np.einsum("nij,nj->ni", turn, centre) - origin
+        away = np.linalg.norm(toward, axis=1)
+        if np.any(away <= radius):
+            return np.ones(len(rays), bool)
+        # A little wide, for the rounding of single precision.
+        least = np.sqrt(1 - (radius / away) ** 2) - 1e-5
+        cosine = rays.astype(np.float32) @ (toward / away[:, None]).T.astype(np.float32)
+        return np.any(cosine >= least.astype(np.float32), axis=1)
+
+
+def _bounding_spheres(model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Number, middle (in its frame) and radius of every body that moves."""
+    bodies = np.flatnonzero(model.body_mocapid >= 0)
+    centre, radius = np.zeros((len(bodies), 3)), np.zeros(len(bodies))
+    for row, body in enumerate(bodies):
+        geoms = np.flatnonzero(model.geom_bodyid == body)
+        centre[row] = model.geom_pos[geoms].mean(axis=0)
+        away = np.linalg.norm(model.geom_pos[geoms] - centre[row], axis=1)
+        radius[row] = (away + model.geom_rbound[geoms]).max()
+    return bodies, centre, radius
 
 
 def _placed(body: Body, shape: Shape) -> tuple[np.ndarray, np.ndarray]:

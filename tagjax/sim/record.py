@@ -18,12 +18,14 @@ from .sensors import SENSORS, frame_times, kinect_v2_intrinsics, xtion_intrinsic
 from .session import mask_boxes
 from .shading import ILLUMINATION, Shader, auto_exposure
 from .virtual_tag import Track
+from .visibility import steps_every
 from .world import STEP_S, World, tag_dipole, tag_path
 
 PERSON_RCS_M2 = 1.0
-"""Radar cross section of a standing person at 900 MHz (from memory)."""
+"""Radar cross section of a standing person at 900 MHz: the upper end of what was measured (see `Scatterers`)."""
 
-_SIGHT_EVERY = 5  # steps between line-of-sight checks: 0.05 s, in which a walker moves by 7 cm
+_SIGHT_EVERY_S = 0.05
+"""Between looks at lines of sight and at where people are; a walker moves by 7 cm in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +70,7 @@ class Filmed:
     antennas_m: tuple[tuple[float, float, float], ...]
     panels: tuple[Panel, ...] = ()
     inventory: InventorySettings = dataclasses.field(default_factory=InventorySettings)
+    antenna_axes: tuple[tuple[float, float, float], ...] | None = None  # unit; at camera_look_at_m if None
 
 
 def room_environment(panels: Sequence[Panel], num_people: int) -> Environment:
@@ -124,7 +127,7 @@ def film(
         hits = stage.cast(view)
         surface = shader.surface(hits)
         light = (
-            shader.blurred(view, step, capture.shutter_s / STEP_S)
+            shader.blurred(view, step, capture.shutter_s / STEP_S, shadows=capture.shadows)
             if capture.shutter_s > 0
             else shader.radiance(hits, surface, shadows=capture.shadows)
         )
@@ -193,7 +196,7 @@ def _read_tags(filmed: Filmed, stage: Stage, seed: int) -> tuple[TagReads, Clock
         return TagReads.empty(), None, {}
     antennas = np.asarray(filmed.antennas_m, float)
     time_s = np.arange(world.num_steps) * STEP_S
-    checked = np.unique(np.append(np.arange(0, world.num_steps, _SIGHT_EVERY), world.num_steps - 1))
+    checked = steps_every(world, _SIGHT_EVERY_S)
     paths, transmission, dipole = {}, {}, {}
     for tag in world.tags:
         path = tag_path(world, tag)
@@ -206,9 +209,10 @@ def _read_tags(filmed: Filmed, stage: Stage, seed: int) -> tuple[TagReads, Clock
         transmission[tag.epc] = np.stack(kept, axis=-1)
         dipole[tag.epc] = tag_dipole(world, tag)
     people = _people(world)
-    every = np.arange(0, world.num_steps, _SIGHT_EVERY)
-    moving = (time_s[every], np.stack([path[every] for path in people], axis=1)) if people else None
+    moving = (time_s[checked], np.stack([path[checked] for path in people], axis=1)) if people else None
     boresight = np.asarray(filmed.camera_look_at_m, float) - antennas
+    if filmed.antenna_axes is not None:
+        boresight = np.asarray(filmed.antenna_axes, float)
     done = simulate_inventory(
         paths,
         antennas,

@@ -1,4 +1,4 @@
-"""Rooms to put people and objects into: a sparse meeting room, a crowded office, a view from the ceiling, a shop.
+"""Rooms to put people and objects into: meeting room, room with a door, crowded office, ceiling view, shop.
 
 World frame: x away from the camera's wall (0 to the length), y to the left (centred), z up. Every draw differs.
 """
@@ -11,10 +11,34 @@ from collections.abc import Callable
 import numpy as np
 
 from ._crowd import Door, Rectangle
-from ._furniture import Panel, Plan, Table, cabinet, chair, distance_to_nearest, pictures, shelf, surface, table, walls
+from ._furniture import (
+    Panel,
+    Plan,
+    Table,
+    cabinet,
+    chair,
+    distance_to_nearest,
+    doorway,
+    pictures,
+    shelf,
+    surface,
+    table,
+    walls,
+)
 from .world import Body, Light
 
-__all__ = ["ROOMS", "Panel", "Room", "Table", "ceiling_view", "make_room", "meeting_room", "office", "shop_floor"]
+__all__ = [
+    "ROOMS",
+    "Panel",
+    "Room",
+    "Table",
+    "ceiling_view",
+    "entrance",
+    "make_room",
+    "meeting_room",
+    "office",
+    "shop_floor",
+]
 
 Point = tuple[float, float, float]
 
@@ -36,6 +60,7 @@ class Room:
     panels: tuple[Panel, ...]  # walls, floor, ceiling and metal, for the radio
     door: Door | None = None
     ambient: float = 0.35
+    antenna_axes: tuple[Point, ...] | None = None  # where each looks, unit vectors; at camera_look_at_m if None
 
     def free_place(self, rng: np.random.Generator, radius_m: float = 0.35) -> tuple[float, float]:
         """A random place of the walk area, `radius_m` from all furniture; `ValueError` if none is found."""
@@ -76,6 +101,42 @@ def meeting_room(rng: np.random.Generator) -> Room:
         cabinet(plan, rng, (x, low, x + rng.uniform(0.7, 1.1), high), rng.uniform(0.7, 1.1), (0.0, -float(side)))
     area = (1.4, -width / 2 + 0.45, length - 0.45, width / 2 - 0.45)
     return _room("meeting room", plan, rng, size, area, door)
+
+
+def entrance(rng: np.random.Generator) -> Room:
+    """A room of about 6 x 5 m whose far wall has an open door to a dark corridor; a table and chairs at one side."""
+    deep = 1.5  # the corridor
+    length, width, height = _size(rng, (5.4, 6.0), (4.8, 5.6), (2.6, 3.0))
+    size = (length + deep, width, height)
+    plan = Plan()
+    walls(plan, rng, size)
+    side = -1 if rng.random() < 0.5 else 1
+    y = side * rng.uniform(0.3, 0.9)
+    doorway(plan, rng, size, length, y)
+    # The table stands on the other side, out of the way from the door.
+    broad, wide = rng.uniform(0.7, 0.9), rng.uniform(1.2, 1.6)
+    low, high = sorted((-side * (width / 2 - 0.1), -side * (width / 2 - 0.1 - broad)))
+    x = rng.uniform(2.4, 2.9)
+    table(plan, rng, (x, low, x + wide, high))
+    cloth = surface(rng, 0.1, 0.6, scale=20.0)
+    for share in (0.25, 0.75):
+        place = (x + share * wide, -side * (width / 2 - 0.1 - broad - 0.3))
+        chair(plan, rng, place, -side * np.pi / 2 + rng.uniform(-0.3, 0.3), cloth)
+    if rng.random() < 0.6:
+        x = rng.uniform(1.8, 2.8)
+        low, high = sorted((side * (width / 2 - 0.4), side * width / 2))
+        cabinet(plan, rng, (x, low, x + rng.uniform(0.7, 1.1), high), rng.uniform(0.7, 1.1), (0.0, -float(side)))
+    area = (1.4, -width / 2 + 0.45, length - 0.45, width / 2 - 0.45)
+    # Behind the wall on the side of the room's axis: a camera on the axis looks past it.
+    places = tuple((length + 0.1 + deep / 2, y - side * away) for away in (1.2, 1.95))
+    room = _room("room with a door", plan, rng, size, area, Door((length + 0.05, y), places))
+    lights = tuple(
+        dataclasses.replace(light, position_m=(share * length, *light.position_m[1:]))
+        for light, share in zip(room.lights, (0.3, 0.65), strict=True)
+    )
+    return dataclasses.replace(
+        room, lights=lights, camera_look_at_m=(0.62 * length, 0.35 * y, room.camera_look_at_m[2])
+    )
 
 
 def office(rng: np.random.Generator) -> Room:
@@ -164,7 +225,12 @@ def shop_floor(rng: np.random.Generator) -> Room:
             x += long + rng.uniform(0.02, 0.2)
     antennas = tuple((x, 0.0, height - 0.1) for x in (1.4, 3.5, 5.6))
     room = _room("shop floor", plan, rng, size, (1.0, -width / 2 + 0.35, length - 0.4, width / 2 - 0.35), None)
-    return dataclasses.replace(room, antennas_m=antennas, camera_position_m=(-0.4, 0.0, height - 0.3))
+    return dataclasses.replace(
+        room,
+        antennas_m=antennas,
+        camera_position_m=(-0.4, 0.0, height - 0.3),
+        antenna_axes=((0.0, 0.0, -1.0),) * 3,
+    )
 
 
 def _size(rng: np.random.Generator, *limits: tuple[float, float]) -> Point:
@@ -234,6 +300,7 @@ def _room(name: str, plan: Plan, rng: np.random.Generator, size: Point, area: Re
 
 ROOMS: dict[str, Callable[[np.random.Generator], Room]] = {
     "meeting_room": meeting_room,
+    "entrance": entrance,
     "office": office,
     "ceiling_view": ceiling_view,
     "shop_floor": shop_floor,

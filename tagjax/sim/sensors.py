@@ -1,6 +1,6 @@
 """What depth sensors make of exact depth: noise, quantisation, missing pixels; cameras, and the times of frames.
 
-Formulas were compared with public implementations of the papers named; values "from memory" are marked.
+Laws of noise are those of the papers named, compared with public implementations; what has no source is called assumed.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from .raycast import Hits
 
 
 def kinect_v2_intrinsics(width: int = 512) -> Intrinsics:
-    """A Kinect v2's depth camera, 512x424 with 366 px of focal length (from memory of its factory calibrations)."""
+    """A Kinect v2's depth camera, 512x424, 366 px of focal length (published calibrations: 355 to 366 px)."""
     return _centred(366.0 * width / 512, width, round(width * 424 / 512))
 
 
 def xtion_intrinsics(width: int = 640) -> Intrinsics:
-    """An Xtion's colour camera to which depth is registered: 4:3, 534 px at 640 (from memory of calibrations)."""
+    """An Xtion's colour camera to which depth is registered: 4:3, 534 px at 640 (535.4 by 539.2 px in the
+    TUM RGB-D benchmark's freiburg3 recordings).
+    """
     return _centred(534.0 * width / 640, width, round(width * 3 / 4))
 
 
@@ -32,18 +34,19 @@ def _centred(focal_px: float, width: int, height: int) -> Intrinsics:
 class KinectV2:
     """Time of flight (Kinect v2). Far, dark, shiny and grazing surfaces return little light: noise, then nothing.
 
-    Returned light is taken as reflectance * cos(incidence) / z^2; the threshold is set so that a white wall is seen to
-    8 m and black cloth is lost at about 2.5 m (from memory of recordings).
+    Returned light is taken as reflectance * cos(incidence) / z^2. Assumed: the threshold, at which a white wall is seen
+    to 8 m and black cloth is lost at about 2.5 m, and what happens at edges. That dark and shiny surfaces, grazing
+    angles and edges (flying pixels) cost depth is measured (Wasenmueller and Stricker, ACCV workshops 2016), not here.
     """
 
     near_m: float = 0.5
     far_m: float = 8.0  # 4.5 m is what the maker vouches for
     reference_reflectance: float = 0.5  # at which the law of the paper is taken to hold
     least_return: float = 0.008  # 1/m^2
-    least_facing: float = 0.1  # cosine: lost from 84 degrees (from memory)
+    least_facing: float = 0.1  # cosine: lost from 84 degrees (assumed)
     shine_loss: float = 0.8  # of the returned light, for a mirror
-    flying_share: float = 0.5  # of pixels beside an edge, that mix both sides (from memory)
-    edge_loss_share: float = 0.25  # of those, dropped by the sensor's own filter (from memory)
+    flying_share: float = 0.5  # of pixels beside an edge, that mix both sides (assumed)
+    edge_loss_share: float = 0.25  # of those, dropped by the sensor's own filter (assumed)
     dropout: float = 0.001
 
     def noise_m(self, depth_m: np.ndarray, facing: np.ndarray, reflectance: np.ndarray) -> np.ndarray:
@@ -92,8 +95,8 @@ class Xtion:
     baseline_m: float = 0.075
     focal_px: float = 580.0  # of the infra-red camera at 640 px
     fraction: int = 8  # of a pixel of disparity
-    least_facing: float = 0.17  # cosine: lost from 80 degrees (from memory)
-    least_return: float = 0.006  # reflectance * facing / z^2 below which no dots are found (from memory)
+    least_facing: float = 0.17  # cosine: lost from 80 degrees (assumed)
+    least_return: float = 0.006  # reflectance * facing / z^2 below which no dots are found (assumed)
     edge_px: float = 0.8  # lateral noise at 640 px (Nguyen et al., 2012)
     dropout: float = 0.002
 

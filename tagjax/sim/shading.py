@@ -30,8 +30,8 @@ _MAX_VIEWS = 4
 class Illumination:
     """How bright the room is, and what the camera makes of it: electrons = light * radiance * full well.
 
-    Noise is shot noise (variance = electrons) and read noise, both lifted by the gain. Well and read noise are those of
-    a small CMOS sensor with pixels of 2 to 3 um (from memory of data sheets).
+    Noise is shot noise (variance = electrons) and read noise, both lifted by the gain. Well and read noise are assumed,
+    of the order of a small CMOS sensor's with pixels of 2 to 3 um.
     """
 
     light: float
@@ -146,7 +146,15 @@ class Shader:
             glare_sum += glare
         return surface.albedo * light_sum[..., None] + glare_sum[..., None]
 
-    def blurred(self, view: Viewpoint, step: SupportsFloat, shutter_steps: float, *, num_casts: int = 5) -> np.ndarray:
+    def blurred(
+        self,
+        view: Viewpoint,
+        step: SupportsFloat,
+        shutter_steps: float,
+        *,
+        num_casts: int = 5,
+        shadows: bool = True,
+    ) -> np.ndarray:
         """Linear light of a frame whose shutter is open for `shutter_steps`, centred on a step: the mean of casts.
 
         Leaves the stage posed at `step`. Costs `num_casts` pictures.
@@ -154,7 +162,7 @@ class Shader:
         total = np.zeros((view.intrinsics.height, view.intrinsics.width, 3), np.float32)
         for part in (np.arange(num_casts) + 0.5) / num_casts - 0.5:
             self.stage.pose(float(step) + part * shutter_steps)
-            total += self.radiance(self.stage.cast(view))
+            total += self.radiance(self.stage.cast(view), shadows=shadows)
         self.stage.pose(step)
         return total / np.float32(num_casts)
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .world import Shape, World, rotation_matrix
+from .objects import bounds
+from .world import Body, Shape, World, rotation_matrix
 
 METAL_REFLECTION = -0.95
 """A material that reflects this well lets nothing through."""
@@ -46,18 +47,46 @@ def line_of_sight(
     for number, body in enumerate(world.bodies):
         if number in exclude:
             continue
-        index = np.clip(when, 0, len(body.poses.position_m) - 1)
-        turn = rotation_matrix(body.poses.quaternion[index])
-        one, two = (np.einsum("nji,nj->ni", turn, p - body.poses.position_m[index]) for p in (start, end))
         group = (body.name, -1) if body.role == "person" else (body.name, number)
         worst = loss.setdefault(group, np.zeros(len(start)))
-        for shape in body.shapes:
+        near, one, two = _near(body, start, end, when)
+        for shape in body.shapes if near.size else ():
             chord = chord_m(shape, one, two)
-            inside[:, number] = np.maximum(inside[:, number], chord)
+            inside[near, number] = np.maximum(inside[near, number], chord)
             material = shape.material
             lost_db = np.inf if material.reflection <= METAL_REFLECTION else material.transmission_db
-            np.maximum(worst, np.where(chord > _GRAZE_M, lost_db, 0.0), out=worst)
+            worst[near] = np.maximum(worst[near], np.where(chord > _GRAZE_M, lost_db, 0.0))
     return Sight(inside, sum(loss.values(), np.zeros(len(start))))
+
+
+def is_free(
+    world: World, start_m: np.ndarray, end_m: np.ndarray, steps: np.ndarray, *, exclude: Sequence[int] = ()
+) -> np.ndarray:
+    """Whether nothing lies between starts and ends, (lines,): `~line_of_sight(...).crossed.any(axis=1)`, but sooner."""
+    start, end, when = np.asarray(start_m, float), np.asarray(end_m, float), np.rint(np.asarray(steps)).astype(int)
+    free = np.ones(len(when), bool)
+    for number, body in enumerate(world.bodies):
+        if number in exclude:
+            continue
+        left = np.flatnonzero(free)
+        near, one, two = _near(body, start[left], end[left], when[left])
+        for shape in body.shapes if near.size else ():
+            free[left[near[chord_m(shape, one, two) > _GRAZE_M]]] = False
+    return free
+
+
+def _near(
+    body: Body, start: np.ndarray, end: np.ndarray, when: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which lines come near a body at their steps, and their starts and ends in its frame."""
+    index = np.clip(when, 0, len(body.poses.position_m) - 1)
+    place = body.poses.position_m[index]
+    low, high = bounds(body.shapes)
+    reach = float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
+    near = np.flatnonzero(_distance(start, end, place) <= reach)
+    turn = rotation_matrix(body.poses.quaternion[index[near]])
+    one, two = (np.einsum("nji,nj->ni", turn, p[near] - place[near]) for p in (start, end))
+    return near, one, two
 
 
 def chord_m(shape: Shape, start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
@@ -83,6 +112,13 @@ def chord_m(shape: Shape, start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
                 enter, leave = np.minimum(enter, one), np.maximum(leave, two)
     span = np.clip(leave, 0, 1) - np.clip(enter, 0, 1)
     return np.maximum(span, 0) * np.linalg.norm(ray, axis=-1)
+
+
+def _distance(start: np.ndarray, end: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Of points (lines, 3) from segments, (lines,)."""
+    ray, away = end - start, point - start
+    share = np.sum(ray * away, axis=-1) / np.maximum(np.sum(ray * ray, axis=-1), 1e-18)
+    return np.linalg.norm(away - np.clip(share, 0, 1)[:, None] * ray, axis=-1)
 
 
 def _slab(start: np.ndarray, ray: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ._doorway import enter_leave
 from ._held import handheld, handover, put_down
 from ._tabled import tabletop
 from ._walked import approach, crowd, grid, shop_exit
@@ -21,6 +22,7 @@ STORIES: Mapping[str, Callable[..., Filmed]] = {
     "handheld": handheld,
     "approach": approach,
     "crowd": crowd,
+    "enter_leave": enter_leave,
     "handover": handover,
     "put_down": put_down,
     "tabletop": tabletop,

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..data.store import save_recording
 from ..recording import RecordingError
+from .inventory import InventorySettings
 from .planar import PlanarSettings, planar_trials, save_planar
 from .record import CaptureSettings, Filmed, film
 from .stories import STORIES, tell
@@ -29,7 +30,7 @@ PLANAR = "planar_101"
 
 MANIFEST = "suite.json"
 
-_VERSION = 1
+_VERSION = 2
 _DRAWS = 6
 
 
@@ -40,6 +41,8 @@ class Variant:
     name: str
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     capture: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    reader: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    story: str | None = None  # the suite's if None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,16 +64,27 @@ class Suite:
     story: str
     seed: int
     duration_s: float = 5.0
+    smoke_s: float = 2.4  # of the suite in small: less where the story is told in less, more where it needs it
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     capture: CaptureSettings = dataclasses.field(default_factory=CaptureSettings)
+    reader: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # what differs from the story's inventory
     variants: tuple[Variant, ...] = (Variant("all"),)
     counts: Counts = dataclasses.field(default_factory=Counts)
 
     def __post_init__(self):
-        if self.story != PLANAR and self.story not in STORIES:
-            raise ValueError(f"{self.name}: unknown story {self.story!r}; known are {', '.join([*STORIES, PLANAR])}.")
-        if not self.duration_s > 0:
-            raise ValueError(f"{self.name}: duration_s is {self.duration_s}; a positive one is needed.")
+        for story in (self.story, *(variant.story for variant in self.variants if variant.story is not None)):
+            if story not in (PLANAR, *STORIES):
+                raise ValueError(f"{self.name}: unknown story {story!r}; known are {', '.join([*STORIES, PLANAR])}.")
+        if not (self.duration_s > 0 and self.smoke_s > 0):
+            raise ValueError(
+                f"{self.name}: duration_s is {self.duration_s}, smoke_s {self.smoke_s}; positive ones are needed."
+            )
+        known = {field.name for field in dataclasses.fields(InventorySettings)}
+        for reader in (self.reader, *(variant.reader for variant in self.variants)):
+            if unknown := sorted(set(reader) - known):
+                raise ValueError(
+                    f"{self.name}: unknown reader setting {', '.join(unknown)}; known are {', '.join(sorted(known))}."
+                )
         if min(dataclasses.astuple(self.counts)) < 0 or not self.variants:
             raise ValueError(f"{self.name}: counts {self.counts}, {len(self.variants)} variants; expected some.")
         names = [variant.name for variant in self.variants]
@@ -78,9 +92,23 @@ class Suite:
             raise ValueError(f"{self.name}: variants share a name: {', '.join(names)}.")
 
     def smoke(self) -> Suite:
-        """The suite in small, for tests: pictures 64 pixels wide, two seconds or so, one test recording a variant."""
+        """The suite in small, for tests: pictures 64 pixels wide, `smoke_s` long, one test recording a variant."""
         capture = dataclasses.replace(self.capture, width=64, frame_rate_hz=min(self.capture.frame_rate_hz, 5.0))
-        return dataclasses.replace(self, duration_s=min(self.duration_s, 2.4), capture=capture, counts=Counts(0, 0, 1))
+        return dataclasses.replace(
+            self, duration_s=min(self.duration_s, self.smoke_s), capture=capture, counts=Counts(0, 0, 1)
+        )
+
+    def glance(self, num_frames: int = 6) -> Suite:
+        """A few frames of the first recording of every variant (of test, or else of training), for a contact sheet.
+
+        The worlds are those of the suite itself.
+        """
+        rate_hz = (num_frames - 0.9) / self.duration_s
+        width = min(self.capture.width or 384, 384)
+        capture = dataclasses.replace(self.capture, width=width, frame_rate_hz=rate_hz, drop_share=0.0)
+        return dataclasses.replace(
+            self, capture=capture, counts=Counts(0, 0, 1) if self.counts.test else Counts(1, 0, 0)
+        )
 
     def items(self) -> list[Item]:
         """Every recording of the suite."""
@@ -126,11 +154,14 @@ def stage_item(item: Item) -> Filmed:
 
     Raises `ValueError` with the last draw's reason if none does.
     """
-    settings = {**item.suite.settings, **item.variant.settings}
+    suite, variant = item.suite, item.variant
+    settings, reader = {**suite.settings, **variant.settings}, {**suite.reader, **variant.reader}
     for draw in range(_DRAWS):
         try:
-            filmed = tell(item.suite.story, np.random.default_rng([item.seed, draw]), item.suite.duration_s, settings)
+            rng = np.random.default_rng([item.seed, draw])
+            filmed = tell(variant.story or suite.story, rng, suite.duration_s, settings)
             filmed.world.check()
+            filmed = dataclasses.replace(filmed, inventory=dataclasses.replace(filmed.inventory, **reader))
         except ValueError as error:
             if draw == _DRAWS - 1:
                 raise ValueError(

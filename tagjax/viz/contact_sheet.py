@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from ..data.store import open_recording
 from ..recording import Recording, RecordingError
 from ..sim.planar import PlanarTrials, open_planar
-from ..sim.suites import PLANAR, Item, Suite
+from ..sim.suites import PLANAR, Item, Suite, make_suite
 
 _EDGE = 2
 _TITLE = 18
@@ -90,4 +91,21 @@ def save_sheet(suite: Suite, folder: Path) -> Path:
         sheet = contact_sheet(recordings, [item.name for item in chosen])
     path = folder / suite.name / "contact_sheet.png"
     cv2.imwrite(str(path), sheet[..., ::-1])
+    return path
+
+
+def save_glance(suite: Suite, folder: Path, *, workers: int = 1, width: int = 960) -> Path:
+    """The sheet of a suite as <folder>/<name>.jpg, at most `width` pixels wide, without its recordings.
+
+    Six frames of the first recording of every variant are simulated for it, and not kept.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        make_suite(suite.glance(), Path(scratch), workers=workers)
+        sheet = cv2.imread(str(save_sheet(suite.glance(), Path(scratch))))
+    assert sheet is not None
+    shrink = min(1.0, width / sheet.shape[1])
+    sheet = cv2.resize(sheet, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{suite.name}.jpg"
+    cv2.imwrite(str(path), sheet, [cv2.IMWRITE_JPEG_QUALITY, 85])
     return path
