@@ -1,0 +1,39 @@
+"""Calibrate a camera from pictures of a checkerboard, and place it over the plane that the board lies on.
+
+python -m experiments.calibrate_camera pictures=<folder> board.columns=7 board.rows=5 board.square_m=0.041
+python -m experiments.calibrate_camera pictures=<folder> 'poses=[{picture: table.png}]' out=camera.json
+python -m experiments.calibrate_camera pictures=<folder> \
+    'poses=[{picture: a.png}, {picture: b.png, origin_m: [0.8, 0.0], turn_deg: 90.0}]'
+"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="calibrate_camera")
+def main(config: DictConfig) -> None:
+    from rich.console import Console
+
+    from tagjax.baselines.tagvision import CalibrateSettings, calibrate_folder, write_calibration
+    from tagjax.config import from_mapping
+
+    values = resolved(config)
+    if values["pictures"] is None:
+        raise SystemExit("calibrate_camera: give pictures=<folder of pictures of the checkerboard>.")
+    console = Console(soft_wrap=True, highlight=False)
+    try:
+        settings = from_mapping(CalibrateSettings, values)
+        found = calibrate_folder(settings)
+    except ValueError as error:
+        raise SystemExit(f"calibrate_camera: {error}") from error
+    write_calibration(found, settings.out)
+    for line in (*found.said(), f"written to {settings.out}"):
+        console.print(line, markup=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""Goller et al.: calibrate on a tag grid, run the scenarios, write both tables, metrics and plots to the run folder.
+
+python -m experiments.simulate benchmark=shop_grid
+python -m experiments.simulate benchmark=shop_exit
+python -m experiments.goller
+python -m experiments.goller scenarios=<folder of the suite> most=3 fit_steps=0
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="goller")
+def main(config: DictConfig) -> None:
+    from rich.console import Console
+
+    from tagjax.baselines.goller.run import GollerConfig, run_goller
+    from tagjax.config import from_mapping
+    from tagjax.data.store import open_recording
+
+    values = resolved(config)
+    checked = from_mapping(GollerConfig, values)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+    console = Console()
+    with console.status("observing", spinner="line") as status:
+        metrics = run_goller(checked, open_recording, folder, on_done=lambda name: status.update(f"observed {name}"))
+    console.print((folder / "tables.md").read_text(), markup=False)
+    console.print(f"run folder: {folder}")
+    print(json.dumps(metrics, allow_nan=False))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Plots of a run: antennas (Figs. 9, 10), hand-over (Fig. 7), ROC (Table I), blobs with their tags (Fig. 12)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, Shaped, UInt8
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ._alarm import Roc
+from ._antennas import AntennaModel, response_db
+from ._evaluate import PAPER_TABLE_1
+from ._reads import GridStatistic
+
+_COLOURS = ("0.45", "tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown")
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def antenna_plot(path: Path, statistic: GridStatistic, model: AntennaModel) -> None:
+    """Measured RSSI at the grid's places beside the fitted Gaussian of each antenna (Figs. 9 and 10)."""
+    num = model.mean_m.shape[0]
+    figure = _figure(3.2 * num + 1, 6.5)
+    measured = np.where(np.isfinite(statistic.mean_dbm), statistic.mean_dbm, float(model.floor_dbm))
+    low, high = statistic.position_m.min(axis=0) - 0.3, statistic.position_m.max(axis=0) + 0.3
+    axes_x, axes_y = np.linspace(low[0], high[0], 80), np.linspace(low[1], high[1], 50)
+    x, y = np.meshgrid(axes_x, axes_y)
+    points = jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), jnp.float32)
+    modelled = np.asarray(jax.vmap(lambda point: response_db(model, point))(points)) + float(model.floor_dbm)
+    grid = np.atleast_2d(figure.subplots(2, num, sharey="row", squeeze=False))
+    limits = (float(model.floor_dbm), float(np.max(measured)))
+    for antenna in range(num):
+        upper, lower = grid[0, antenna], grid[1, antenna]
+        shades = upper.contourf(
+            x, y, modelled[:, antenna].reshape(x.shape), 12, cmap="viridis", vmin=limits[0], vmax=limits[1]
+        )
+        dots = {"cmap": "viridis", "vmin": limits[0], "vmax": limits[1], "edgecolors": "w", "s": 45}
+        upper.scatter(statistic.position_m[:, 0], statistic.position_m[:, 1], c=measured[:, antenna], **dots)
+        upper.plot(*np.asarray(model.mean_m[antenna]), "r+", markersize=12)
+        upper.set(title=f"antenna {antenna + 1}: dots measured, field modelled", xlabel="x (m)", aspect="equal")
+        upper.title.set_fontsize(8)
+        along = np.abs(statistic.position_m[:, 1]) < 0.5
+        lower.plot(statistic.position_m[along, 0], measured[along, antenna], "k.", label="measured, |y| < 0.5 m")
+        line = jnp.asarray(np.stack([axes_x, np.zeros_like(axes_x)], axis=-1), jnp.float32)
+        bell = np.asarray(jax.vmap(lambda point: response_db(model, point))(line))[:, antenna] + float(model.floor_dbm)
+        lower.plot(axes_x, bell, "r", label="Gaussian")
+        lower.set(xlabel="x (m)")
+        lower.grid(alpha=0.3)
+        if antenna == num - 1:
+            figure.colorbar(shades, ax=upper, label="RSSI (dBm)")
+    grid[0, 0].set_ylabel("y (m)")
+    grid[1, 0].set_ylabel("RSSI (dBm)")
+    grid[1, 0].legend(fontsize=7)
+    figure.savefig(path, dpi=110)
+
+
+def roc_plot(path: Path, curves: Mapping[str, Roc], chosen: Mapping[str, tuple[float, float]]) -> None:
+    """Detection against false alarms of each rule, where its threshold puts it, and the paper's points.
+
+    `chosen` maps a curve's name to its (P_D, P_FA).
+    """
+    figure = _figure(5.5, 4.5)
+    axes: Axes = figure.subplots()
+    for number, (name, roc) in enumerate(curves.items()):
+        colour = _COLOURS[1 + number]
+        axes.step(roc.false_alarm, roc.detection, where="post", color=colour, label=name)
+        if name in chosen:
+            detection, false_alarm = chosen[name]
+            axes.plot(false_alarm, detection, "o", color=colour, label=f"{name}, chosen threshold")
+    for rule, (detection, false_alarm) in PAPER_TABLE_1.items():
+        label = {"rfid": "RFID only (paper)", "fused": "RFID + CV (paper)"}[rule]
+        axes.plot(false_alarm, detection, "x" if rule == "rfid" else "+", color="k", markersize=10, label=label)
+    axes.set(xlabel="false alarms of still tags, P_FA", ylabel="detection, P_D", xlim=(-0.02, 1.02), ylim=(-0.02, 1.04))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def association_plot(
+    path: Path,
+    time_s: Shaped[np.ndarray, " time"],
+    probability: Shaped[np.ndarray, "time states"],
+    identity: Int[np.ndarray, "time slots"],
+    state: Int[np.ndarray, " time"],
+    tag_x_m: Shaped[np.ndarray, " time"],
+    *,
+    title: str = "",
+) -> None:
+    """Association probability of one tag over time (Fig. 7a): background and every blob; the truth as a band above.
+
+    `state` is the right one (0 background, 1 + slot, -1 not known). Below, the tag's located x.
+    """
+    figure = _figure(8, 5)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+    names = [name for name in dict.fromkeys(identity.ravel().tolist()) if name]
+    true_name = np.where(
+        state > 0, np.take_along_axis(identity, np.maximum(state - 1, 0)[:, None], axis=1)[:, 0], -state
+    )
+    true_name = np.where(state == 0, 0, np.where(state < 0, -1, true_name))
+    for number, name in enumerate([0, *names]):
+        colour = _COLOURS[number % len(_COLOURS)]
+        share = probability[:, 0] if name == 0 else np.sum(np.where(identity == name, probability[:, 1:], 0.0), axis=1)
+        there = np.ones(len(time_s), bool) if name == 0 else np.any(identity == name, axis=1)
+        label = "background" if name == 0 else f"blob {name}"
+        upper.plot(time_s, np.where(there, share, np.nan), color=colour, label=label, linewidth=1.6)
+        band = (true_name == name).tolist()
+        upper.fill_between(time_s, 1.03, 1.08, where=band, color=colour, step="mid", linewidth=0)
+    upper.set(ylabel="association probability", ylim=(-0.02, 1.1), title=f"{title} (band: truth, where known)")
+    upper.legend(loc="center left", fontsize=8)
+    lower.plot(time_s, tag_x_m, "k", linewidth=1.2)
+    lower.set(xlabel="time (s)", ylabel="tag's x (m)")
+    for axes in (upper, lower):
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+
+
+def scene_picture(
+    path: Path,
+    pictures: UInt8[np.ndarray, "some height width 3"],
+    boxes_px: Float[np.ndarray, "some slots 4"],
+    labels: list[list[str]],
+    alarmed: list[list[bool]],
+) -> None:
+    """Pictures side by side with each blob's box and the tags it is said to carry; alarmed ones in red."""
+    out = []
+    for picture, boxes, texts, red in zip(pictures, boxes_px, labels, alarmed, strict=True):
+        canvas = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+        for box, text, is_red in zip(boxes, texts, red, strict=True):
+            if not np.isfinite(box).all():
+                continue
+            colour = (235, 40, 40) if is_red else (40, 90, 235)
+            x0, y0, x1, y1 = (int(v) for v in 2 * box)
+            cv2.rectangle(canvas, (x0, y0), (x1, y1), colour, 2)
+            cv2.putText(
+                canvas, text, (max(x0, 2), max(y0 - 6, 14)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA
+            )
+        out.append(canvas)
+    cv2.imwrite(str(path), np.concatenate(out, axis=1)[..., ::-1])

@@ -1,0 +1,206 @@
+"""A whole run: calibrate, fit, choose thresholds, count, and write tables, metrics and plots into a folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ...recording import Recording
+from ._evaluate import (
+    TagOutcome,
+    location_error_m,
+    markdown,
+    outcomes,
+    plain,
+    rule_roc,
+    table_1,
+    table_2,
+    thresholds,
+)
+from ._figures import antenna_plot, association_plot, roc_plot, scene_picture
+from ._fit import Carried, carried, fit_association, true_states
+from ._reads import grid_statistic
+from ._site import find_site
+from ._system import Calibration, GollerSettings, Observations, calibrate, decide, observe, save_calibration
+
+Example = tuple[str, Observations, Carried]
+"""Variant, what was seen, what was true."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GollerConfig:
+    """What a run needs: recordings of a tag grid, of the scenarios, of a hand-over; and how much is fitted."""
+
+    grid: str  # a recording
+    scenarios: str  # a suite's folder with train/, validation/ and test/
+    handover: str | None = None  # a recording
+    settings: GollerSettings = dataclasses.field(default_factory=GollerSettings)
+    floor_dbm: float = -80.0
+    fit_means: bool = False
+    fit_steps: int = 120  # 0 keeps the starting values
+    learning_rate: float = 0.05
+    most: int | None = None  # recordings of a variant in each split; all if None
+
+
+def scenario_paths(folder: Path, split: str, most: int | None = None) -> list[tuple[str, Path]]:
+    """Variant and path of a split's recordings (<suite>-<variant>-<split>-<number>.zarr), in order of number."""
+    found = []
+    for path in (folder / split).glob("*.zarr"):
+        parts = path.stem.split("-")
+        if len(parts) != 4 or not parts[3].isdigit():
+            raise ValueError(
+                f"{path}: expected a name <suite>-<variant>-<split>-<number>.zarr, as experiments.simulate gives."
+            )
+        if most is None or int(parts[3]) < most:
+            found.append((parts[1], int(parts[3]), path))
+    return [(variant, path) for variant, _, path in sorted(found)]
+
+
+def run_goller(
+    config: GollerConfig,
+    open_recording: Callable[[str], Recording],
+    folder: Path,
+    *,
+    on_done: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Everything of the paper's evaluation on simulated recordings; returns what `metrics.json` holds.
+
+    Widths and rates are fitted on the train split, thresholds chosen on train and validation, rates counted on test.
+    Raises `ValueError` where a split or the grid is missing.
+    """
+    settings = config.settings
+    grid = open_recording(config.grid)
+    calibration = calibrate(grid, floor_dbm=config.floor_dbm, fit_means=config.fit_means)
+    antenna_plot(folder / "antennas.png", grid_statistic(grid, find_site(grid)), calibration.location.antennas)
+    start, num_frames = time.perf_counter(), 0
+    splits: dict[str, list[Example]] = {}
+    for split in ("train", "validation", "test"):
+        splits[split] = []
+        for variant, path in scenario_paths(Path(config.scenarios), split, config.most):
+            recording = open_recording(str(path))
+            splits[split].append((variant, observe(recording, settings), carried(recording)))
+            num_frames += recording.num_frames
+            on_done(recording.name)
+        if not splits[split]:
+            raise ValueError(f"{config.scenarios}/{split}: no recording. Simulate the suite: experiments.simulate.")
+    seen_ms = 1e3 * (time.perf_counter() - start) / num_frames
+    losses = np.zeros(0)
+    if config.fit_steps:
+        pairs = [(seen, truth) for _, seen, truth in splits["train"]]
+        calibration, losses = fit_association(
+            calibration, pairs, settings, num_steps=config.fit_steps, learning_rate=config.learning_rate
+        )
+    known = _outcomes(calibration, splits["train"] + splits["validation"], settings)
+    fused, rfid = thresholds(known)
+    calibration = eqx.tree_at(
+        lambda c: (c.alarm_threshold, c.rssi_threshold_dbm),
+        calibration,
+        (jnp.asarray(fused, jnp.float32), jnp.asarray(rfid, jnp.float32)),
+    )
+    save_calibration(calibration, folder / "calibration.json")
+    start = time.perf_counter()
+    found = _outcomes(calibration, splits["test"], settings)
+    decided_ms = 1e3 * (time.perf_counter() - start) / max(sum(len(s.time_s) for _, s, _ in splits["test"]), 1)
+    first, second = table_1(found, fused, rfid), table_2(found, fused)
+    (folder / "tables.md").write_text(markdown(first, second))
+    _plots(folder, config, calibration, found, first, open_recording)
+    errors = location_error_m(calibration, [(seen, truth) for _, seen, truth in splits["test"]], settings)
+    metrics = {
+        "table_1": {name: plain(row) for name, row in first.items()},
+        "table_2": {name: plain(row) for name, row in second.items()},
+        "thresholds": {"fused": fused, "rfid_dbm": rfid},
+        "fitted": _fitted(calibration),
+        "fit_loss": [float(losses[0]), float(losses[-1])] if len(losses) else None,
+        "location_error_m": {"median": float(np.median(errors)), "p90": float(np.quantile(errors, 0.9))},
+        "num_recordings": {split: len(examples) for split, examples in splits.items()},
+        "never_read": sum(not one.read for one in found),
+        "milliseconds_a_frame": {"both sensors, reading included": seen_ms, "location and association": decided_ms},
+    }
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+    (folder / "outcomes.json").write_text(json.dumps([_row(one) for one in found], indent=0, allow_nan=False) + "\n")
+    return metrics
+
+
+def _outcomes(calibration: Calibration, examples: list[Example], settings: GollerSettings) -> list[TagOutcome]:
+    return [one for variant, seen, truth in examples for one in outcomes(calibration, variant, seen, truth, settings)]
+
+
+def _row(one: TagOutcome) -> dict[str, Any]:
+    return {**dataclasses.asdict(one), "rfid": one.rfid if np.isfinite(one.rfid) else None}
+
+
+def _fitted(calibration: Calibration) -> dict[str, Any]:
+    parts = {"location": calibration.location, "association": calibration.association}
+    return {
+        f"{part}.{field.name.removeprefix('log_')}": np.exp(np.asarray(getattr(model, field.name))).tolist()
+        for part, model in parts.items()
+        for field in dataclasses.fields(model)
+        if field.name.startswith("log_")
+    }
+
+
+def _plots(
+    folder: Path,
+    config: GollerConfig,
+    calibration: Calibration,
+    found: list[TagOutcome],
+    first: dict[str, Any],
+    open_recording: Callable[[str], Recording],
+) -> None:
+    simple = [one for one in found if one.variant == "sp_st_still"]
+    if {"leaves", "still"} <= {one.kind for one in simple}:
+        curves = {
+            "RFID only": rule_roc(simple, "rfid", stays=False),
+            "RFID + CV": rule_roc(simple, "fused", stays=False),
+        }
+        rows = {"RFID only": first["rfid"], "RFID + CV": first["fused"]}
+        roc_plot(folder / "roc.png", curves, {name: (row.detected, row.false_alarm) for name, row in rows.items()})
+    if config.handover is None:
+        return
+    recording = open_recording(config.handover)
+    seen, truth = observe(recording, config.settings), carried(recording)
+    decision, states = decide(calibration, seen, config.settings), true_states(seen, truth)
+    for row, epc in enumerate(seen.epcs):
+        association_plot(
+            folder / ("handover.png" if row == 0 else f"handover_{row + 1}.png"),
+            seen.time_s,
+            np.asarray(decision.probability[row]),
+            seen.blobs.identity,
+            states[row],
+            np.asarray(decision.location.position_m[row, :, 0]),
+            title=f"{recording.name}, tag {epc[-4:]}",
+        )
+    _scene(
+        folder / "handover_scene.png",
+        recording,
+        seen,
+        np.asarray(decision.probability),
+        np.asarray(decision.exit_score),
+        float(calibration.alarm_threshold),
+    )
+
+
+def _scene(path, recording, seen, probability, score, threshold) -> None:
+    """Five moments with the blobs' boxes and their tags."""
+    frames = np.linspace(0.08, 0.92, 5) * (recording.num_frames - 1)
+    frames = frames.astype(int)
+    best = np.argmax(probability, axis=2)
+    labels, red = [], []
+    for frame in frames:
+        texts, flags = [], []
+        for slot, name in enumerate(seen.blobs.identity[frame]):
+            mine = [tag for tag in range(len(seen.epcs)) if best[tag, frame] == slot + 1]
+            texts.append(f"{name}: " + " ".join(f"T{tag + 1}" for tag in mine))
+            flags.append(any(score[tag, frame] >= threshold for tag in mine))
+        labels.append(texts)
+        red.append(flags)
+    pictures = np.stack([np.asarray(recording.colour[int(frame)]) for frame in frames])
+    scene_picture(path, pictures, seen.blobs.box_px[frames], labels, red)
