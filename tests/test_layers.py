@@ -33,6 +33,7 @@ LAYERS = {
     "tracer": 3,
     "tagattention": 3,
     "tagattention_paper": 3,
+    "baselines": 3,
     "sim": 3,
     "data": 3,
     "training": 4,

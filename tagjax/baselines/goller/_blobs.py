@@ -32,7 +32,7 @@ class BlobSettings:
     learning_rate: float = 0.002  # share of a frame that enters it
     match: float = 16.0  # squared distance, in variances, up to which a pixel is background
     shadow: float = 0.5  # darkest shadow, as a share of the background's brightness
-    warm_up: Literal["median", "online"] = "median"  # the recording's median picture first, or nothing
+    warm_up: Literal["empty", "online"] = "empty"  # the background model is shown the empty scene first, or nothing
     area_m2: tuple[float, float] = (0.08, 2.5)  # seen area, least and most, when a blob is born
     max_speed_m_s: float = 3.0
     min_travel_m: float = 0.3  # from where it was first seen, before a blob counts

@@ -141,7 +141,7 @@ def observe(
     names = tuple(recording.resolve_epcs(epcs))
     site = find_site(recording)
     tracker = BlobTracker(settings.blobs, site, recording.intrinsics)
-    if settings.blobs.warm_up == "median":
+    if settings.blobs.warm_up == "empty":
         tracker.warm_up(empty_picture(recording))
     time_s = recording.frame_time_s()
     no_depth = np.zeros(recording.image_shape, np.float32)
