@@ -27,8 +27,6 @@ from tagjax.flow.network import AbstractFlowNetwork, flow_both_ways
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall, halve, look_up, look_up_products
 
-pytestmark = pytest.mark.slow  # with compiling, more than the default run has time for
-
 CONF = Path(__file__).parents[1] / "conf" / "flow"
 
 PUBLISHED: dict[str, Callable[[], AbstractFlowNetwork]] = {
@@ -48,11 +46,15 @@ TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
 
 @functools.cache
 def _tiny(name: str) -> AbstractFlowNetwork:
-    return TINY[name]()
+    return eqx.filter_jit(TINY[name])()
 
 
 def _noise(*shape: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def _side(name: str) -> int:
+    return 32 if name.startswith("raft") else 64
 
 
 def _pictures(height: int = 64, width: int = 64, count: int = 2, seed: int = 0) -> jax.Array:
@@ -127,20 +129,21 @@ def test_estimates_go_from_rough_to_the_pictures_size(name, strides):
 
 @pytest.mark.parametrize("name", [*TINY])
 def test_from_scratch_the_flow_is_nearly_zero(name):
-    first, second = _pictures()
+    first, second = _pictures(_side(name), _side(name))
     for other in (second, first):
         for flow in _jitted()(_tiny(name), first, other):
-            assert float(jnp.abs(flow).max()) < 0.5
-            assert np.isfinite(flow).all()
+            assert np.abs(np.asarray(flow)).max() < 0.5
 
 
-@pytest.mark.parametrize("name", ["flownet_s", "flownet_c", "raft_small", "pyramid"])
+@pytest.mark.parametrize(
+    "name", ["pyramid", *(pytest.param(name, marks=pytest.mark.slow) for name in ("flownet_c", "raft_small"))]
+)
 def test_jit_agrees_with_eager_and_vmap_with_a_loop(name):
-    network, pictures = _tiny(name), _pictures(count=3)
+    network, pictures = _tiny(name), _pictures(_side(name), _side(name), count=3)
     firsts, seconds = pictures[:2], pictures[1:]
     jitted = [_jitted()(network, first, second) for first, second in zip(firsts, seconds, strict=True)]
     batched = eqx.filter_jit(eqx.filter_vmap(_flows, in_axes=(None, 0, 0)))(network, firsts, seconds)
-    scale = float(jnp.abs(jitted[0][-1]).max())
+    scale = np.abs(np.asarray(jitted[0][-1])).max()
     assert scale > 0
     for plain, whole in zip(_flows(network, firsts[0], seconds[0]), jitted[0], strict=True):
         np.testing.assert_allclose(plain, whole, atol=1e-4 * scale)
@@ -149,17 +152,20 @@ def test_jit_agrees_with_eager_and_vmap_with_a_loop(name):
             np.testing.assert_allclose(many[n], one, atol=1e-4 * scale)
 
 
-@pytest.mark.parametrize("name", [*TINY])
+@pytest.mark.parametrize(
+    "name", ["pyramid", *(pytest.param(name, marks=pytest.mark.slow) for name in ("flownet_c", "raft_small"))]
+)
 def test_gradients_are_finite_on_any_picture_and_reach_every_weight(name):
-    network = _tiny(name)
-    first, second = _pictures()
-    weights = [jnp.asarray(1.0 + n) for n in range(len(_jitted()(network, first, second)))]
-    flat = jnp.full((64, 64, 3), 0.5)
-    for one, other in ((first, first), (flat, flat), (flat, first), (flat * 0, flat * 0), (first, second)):
+    network, side = _tiny(name), _side(name)
+    first, second = _pictures(side, side)
+    weights = [np.float32(1 + n) for n in range(len(_jitted()(network, first, second)))]
+    flat, dark = jnp.full((side, side, 3), 0.5), jnp.zeros((side, side, 3))
+    for one, other in ((first, first), (flat, flat), (flat, first), (dark, dark), (first, second)):
         gradient, _ = _pulled()(network, one, other, weights)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(gradient)]
+        assert all(np.isfinite(leaf).all() for leaf in leaves)
     # A bias before an instance norm has none.
-    assert all(jnp.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient) if leaf.ndim > 1)
+    assert all(np.abs(leaf).max() > 0 for leaf in leaves if leaf.ndim > 1)
 
 
 def test_both_ways_are_each_way():
@@ -178,19 +184,19 @@ def _loud(network: Any, where: Callable[[Any], Any], gain: float) -> Any:
 
 @pytest.mark.parametrize(
     ("name", "size", "shift"),
-    [("pyramid", 160, 16), ("raft", 256, 32)],
+    [("pyramid", 128, 16), pytest.param("raft", 192, 8, marks=pytest.mark.slow)],
 )
 def test_what_moves_with_the_picture_moves_the_flow_along(name, size, shift):
     """A pattern far from the borders, moved by a multiple of the divisor: the same flow, moved."""
     if name == "pyramid":
         network = PyramidFlow((6, 8), (1, 1), decoder_widths=((8,), (8,)))
-        network = _loud(network, lambda n: [decoder.head.weight for decoder in n.decoders], 30.0)
+        network = _loud(network, lambda n: [decoder.head.weight for decoder in n.decoders], 5.0)
     else:
-        network = RAFTSmall(updates=1, levels=2, radius=1)
-        network = _loud(network, lambda n: n.update.head.weight, 300.0)
-    assert shift % (2 * network.divisor) == 0
+        network = eqx.filter_jit(lambda: RAFTSmall(updates=1, levels=1, radius=1))()
+        network = _loud(network, lambda n: n.update.head.weight, 100.0)
+    assert shift % network.divisor == 0
     patch = _pictures(24, 24, seed=3)
-    left, top = size // 2 - 24, size // 2 - 16
+    left, top = size // 2 - 16, size // 2 - 8
 
     def scene(dx: int, dy: int) -> jax.Array:
         canvas = jnp.full((2, size, size, 3), 0.3)
@@ -199,10 +205,10 @@ def test_what_moves_with_the_picture_moves_the_flow_along(name, size, shift):
     flow = _jitted()(network, *scene(0, 0))[-1]
     moved = _jitted()(network, *scene(shift, -shift))[-1]
     # Compared where neither the border nor the other half of the scene reaches.
-    here = flow[top : top + 24, left : left + 24]
-    there = moved[top - shift : top - shift + 24, left + shift : left + shift + 24]
-    assert float(jnp.abs(here).max()) > 0.2
-    np.testing.assert_allclose(there, here, atol=2e-3 * float(jnp.abs(here).max()))
+    here = np.asarray(flow)[top : top + 24, left : left + 24]
+    there = np.asarray(moved)[top - shift : top - shift + 24, left + shift : left + shift + 24]
+    assert np.ptp(here) > 1
+    np.testing.assert_allclose(there, here, atol=1e-3 * np.ptp(here))
 
 
 @pytest.mark.parametrize("name", ["flownet_s", "flownet_c"])
@@ -220,25 +226,27 @@ def test_the_flownets_own_unit_does_not_leak_out(name):
 def test_a_raft_update_answers_for_its_own_correction_only():
     network = _tiny("raft_small")
     for which, answers in (((1.0, 0.0), 1), ((0.0, 1.0), 1), ((1.0, 1.0), 2)):
-        weights = [jnp.asarray(weight) for weight in (*which, 0.0)]
-        gradient, _ = _pulled()(network, *_pictures(), weights)
-        np.testing.assert_allclose(gradient.update.head.bias, [answers * 64.0] * 2, rtol=1e-5)
+        weights = [np.float32(weight) for weight in (*which, 0.0)]
+        gradient, flows = _pulled()(network, *_pictures(32, 32), weights)
+        np.testing.assert_allclose(gradient.update.head.bias, [answers * flows[0][..., 0].size] * 2, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_raft_without_the_volume_is_raft():
     networks = (_tiny("raft_small"), _tiny("raft_small_lean"))
     loud = [_loud(network, lambda n: n.update.head.weight, 300.0) for network in networks]
-    weights = [jnp.asarray(weight) for weight in (1.0, -2.0, 0.1)]
-    (gradient, flows), (lean_gradient, lean_flows) = (_pulled()(network, *_pictures(), weights) for network in loud)
-    assert float(jnp.abs(flows[-1]).max()) > 0.5
-    for one, other in zip(flows, lean_flows, strict=True):
+    weights = [np.float32(weight) for weight in (1.0, -2.0, 0.1)]
+    found, expected = (_pulled()(network, *_pictures(32, 32), weights) for network in loud)
+    assert np.abs(np.asarray(expected[1][-1])).max() > 0.5
+    leaves, lean_leaves = (jax.tree.leaves(each[0]) for each in (found, expected))
+    scale = np.median([np.abs(np.asarray(leaf)).max() for leaf in leaves])
+    for one, other in zip(found[1], expected[1], strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4)
-    leaves = jax.tree.leaves(gradient)
-    scale = np.median([float(jnp.abs(leaf).max()) for leaf in leaves])
-    for one, other in zip(leaves, jax.tree.leaves(lean_gradient), strict=True):
+    for one, other in zip(leaves, lean_leaves, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4 * scale)
 
 
+@pytest.mark.slow
 def test_raft_takes_pictures_smaller_than_its_pyramid():
     flows = eqx.filter_eval_shape(_flows, RAFTSmall(updates=1), *[jax.ShapeDtypeStruct((8, 24, 3), jnp.float32)] * 2)
     assert flows[0].shape == (1, 3, 2)
@@ -269,6 +277,7 @@ def test_the_configuration_names_every_setting(name):
     assert _count(eqx.filter_eval_shape(lambda: build(settings))) == _count(eqx.filter_eval_shape(PUBLISHED[name]))
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["flownet_s", "flownet_c"])
 def test_flownet_at_full_width_runs(name):

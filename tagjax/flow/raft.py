@@ -6,7 +6,6 @@ the second picture, and a recurrent unit corrects the flow. One `lax.scan` for a
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any
 
@@ -137,15 +136,9 @@ def _hats(centre: Array, radius: int, size: int) -> Array:
     return jax.nn.relu(1 - jnp.abs(at[..., None] - jnp.arange(size, dtype=centre.dtype)[None, None]))
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def look_up(
+def _look_up(
     volume: Float[Array, "pixel rows columns"], x: Float[Array, " pixel"], y: Float[Array, " pixel"], radius: int
 ) -> Float[Array, "pixel window window"]:
-    """Each pixel's costs in the window around its (x, y), row before column, bilinearly; 0 beyond the border.
-
-    The gradient reaches the volume only. It is a product of dense weights, without a scatter: on two CPU cores
-    half the time of the gather's own gradient.
-    """
     pixels, rows, columns = volume.shape
     reach = jnp.arange(-radius, radius + 1, dtype=x.dtype)
     u, v = jnp.broadcast_arrays(x[:, None, None] + reach[None, None], y[:, None, None] + reach[None, :, None])
@@ -162,7 +155,7 @@ def look_up(
 
 
 def _look_up_forward(volume: Array, x: Array, y: Array, radius: int) -> tuple[Array, Any]:
-    return look_up(volume, x, y, radius), (x, y, volume.shape)
+    return _look_up(volume, x, y, radius), (x, y, volume.shape)
 
 
 def _look_up_backward(radius: int, kept: Any, cotangent: Array) -> tuple[Array, Array, Array]:
@@ -171,7 +164,19 @@ def _look_up_backward(radius: int, kept: Any, cotangent: Array) -> tuple[Array, 
     return jnp.einsum("nyw,nyh->nhw", along, _hats(y, radius, rows)), jnp.zeros_like(x), jnp.zeros_like(y)
 
 
-look_up.defvjp(_look_up_forward, _look_up_backward)
+_differentiable_look_up = jax.custom_vjp(_look_up, nondiff_argnums=(3,))
+_differentiable_look_up.defvjp(_look_up_forward, _look_up_backward)
+
+
+def look_up(
+    volume: Float[Array, "pixel rows columns"], x: Float[Array, " pixel"], y: Float[Array, " pixel"], radius: int
+) -> Float[Array, "pixel window window"]:
+    """Each pixel's costs in the window around its (x, y), row before column, bilinearly; 0 beyond the border.
+
+    The gradient reaches the volume only. It is a product of dense weights, without a scatter: on two CPU cores
+    half the time of the gather's own gradient.
+    """
+    return _differentiable_look_up(volume, x, y, radius)
 
 
 def look_up_products(
