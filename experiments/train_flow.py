@@ -2,7 +2,7 @@
 
 python -m experiments.train_flow
 python -m experiments.train_flow init=default recipe=fine_tune 'data.sequences=[my_video.mp4]'
-python -m experiments.train_flow flow=raft_small loop.num_steps=50000
+python -m experiments.train_flow recipe=raft
 """
 
 from __future__ import annotations

@@ -6,13 +6,17 @@ import inspect
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import optax
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from tagjax.config import EvaluateConfig, TrainConfig, build, from_mapping
+from tagjax.config import EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
+from tagjax.evaluation.flow import FlowEvaluationSettings
+from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.tagattention import TagAttention
 from tagjax.tracer import AbstractTracer
 
@@ -44,12 +48,41 @@ def test_every_training_configuration_is_valid(override: str) -> None:
     assert config.objective.weights()
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["flow=raft_small"],
+        ["recipe=fine_tune"],
+        ["recipe=raft"],
+        ["recipe=flownet"],
+        ["recipe=flownet", "flow=flownet_c"],
+    ],
+)
+def test_every_flow_training_configuration_is_valid(overrides: list[str]) -> None:
+    config = from_mapping(TrainFlowConfig, _compose("train_flow", *overrides))
+    made = jax.eval_shape(lambda: eqx.filter(build(config.flow), eqx.is_array))
+    assert isinstance(made, AbstractFlowNetwork)
+    for size in (config.data.variation.height, config.data.variation.width, config.data.variation.margin_px):
+        assert size % made.divisor == 0
+    assert isinstance(build(config.optimizer), optax.GradientTransformation)
+
+
+def test_every_recipe_is_tested() -> None:
+    assert set(_options("recipe")) == {"recipe=fine_tune", "recipe=flownet", "recipe=raft"}
+
+
 def test_evaluation_configurations_are_valid() -> None:
     assert from_mapping(EvaluateConfig, _compose("evaluate")).tracer is None
     named = from_mapping(EvaluateConfig, _compose("evaluate", "tracer=tagattention_paper", "frames=[0,20]"))
     assert named.tracer is not None
     assert isinstance(build(named.tracer), AbstractTracer)
     assert named.frames == (0, 20)
+
+
+def test_flow_evaluation_configurations_are_valid() -> None:
+    settings = from_mapping(FlowEvaluationSettings, _compose("evaluate_flow"))
+    assert settings.flows
 
 
 def test_a_misspelt_override_is_refused() -> None:

@@ -30,6 +30,7 @@ from tagjax.data.picture_pairs import (
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.flow.pyramid import PyramidFlow
+from tagjax.flow.raft import RAFTSmall
 from tagjax.recording import RecordingError
 from tagjax.sim.flow_pairs import FlowPairSettings
 from tagjax.training.checkpoint import Checkpoints
@@ -183,8 +184,20 @@ def test_small_pictures_are_enlarged_to_the_cut() -> None:
     assert found["clean"].shape == (2, 32, 48, 3)
 
 
+def test_the_clean_pictures_reach_further_by_the_margin() -> None:
+    settings = dataclasses.replace(PLAIN, margin_px=8)
+    pair = smooth_pictures(2, 64, 80)
+    for seed in range(4):
+        found = vary(pair, np.random.default_rng(seed), settings)
+        assert found["clean"].shape == (2, 48, 64, 3)
+        np.testing.assert_array_equal(found["clean"][:, 8:-8, 8:-8], found["seen"])
+    wide = vary(smooth_pictures(2, 20, 20), np.random.default_rng(0), settings)
+    assert wide["clean"].shape == (2, 48, 64, 3)
+
+
 @pytest.mark.parametrize(
-    "change", [{"scale": (0.0, 1.0)}, {"scale": (2.0, 1.0)}, {"gaps": ()}, {"gaps": (0,)}, {"height": 8}]
+    "change",
+    [{"margin_px": -1}, {"scale": (0.0, 1.0)}, {"scale": (2.0, 1.0)}, {"gaps": ()}, {"gaps": (0,)}, {"height": 8}],
 )
 def test_impossible_variation_is_refused(change: dict) -> None:
     with pytest.raises(ValueError, match=r"expected|too small"):
@@ -265,6 +278,23 @@ def test_step_learns_counts_and_skips_what_is_not_finite() -> None:
         np.testing.assert_array_equal(a, np.asarray(b))
     with pytest.raises(ValueError, match="at least one pair"):
         flow_step(state, [], optimizer, settings, 10.0)
+
+
+def test_a_recurrent_network_learns_by_its_sequence_beyond_the_crop() -> None:
+    settings = FlowLossSettings(census_radius=1, census_stride=1, sequence_decay=0.8)
+    optimizer = optax.adam(1e-3)
+    network = eqx.filter_jit(lambda: RAFTSmall(updates=2, levels=1, radius=1))()
+    samples = [
+        {"clean": np.pad(sample["clean"], ((0, 0), (8, 8), (8, 8), (0, 0)), mode="reflect"), "seen": sample["seen"]}
+        for sample in batch()
+    ]
+    state = FlowTrainState.create(network, optimizer, seed=0)
+    state, numbers = flow_step(state, samples, optimizer, settings, 10.0)
+    assert numbers["skipped"] == 0
+    assert numbers["gradient_norm"] > 0
+    assert np.isfinite(numbers["loss"])
+    with pytest.raises(ValueError, match="one shape before the last"):
+        flow_step(FlowTrainState.create(small_network(), optimizer, seed=0), samples, optimizer, settings, 10.0)
 
 
 def test_average_of_the_weights_is_the_mean_at_first_and_a_running_one_later() -> None:
@@ -404,6 +434,10 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
         configured(tmp_path, average_over=0)
     with pytest.raises(ConfigError, match="Nothing to learn from"):
         configured(tmp_path, data={"drawn": {"num_pairs": 0}})
+    for name, value in (("height", 36), ("margin_px", 4)):
+        odd = configured(tmp_path, data={"variation": {"height": 32, "width": 32, name: value}})
+        with pytest.raises(ValueError, match=f"variation.{name} is {value}; this network takes multiples of 8"):
+            run_flow_training(odd, tmp_path / "run")
     with pytest.raises(ValueError, match="is no network that learns"):
         run_flow_training(configured(tmp_path, flow={"_target_": "tagjax.flow.opencv.DISFlow"}), tmp_path / "run")
 

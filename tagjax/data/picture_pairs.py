@@ -42,6 +42,7 @@ class VariationSettings:
 
     height: int = 128
     width: int = 160
+    margin_px: int = 0  # at each side of the cut, seen by the loss alone (SMURF's full-image warping)
     scale: tuple[float, float] = (0.7, 1.4)  # log-uniform; a picture too small is enlarged to fit
     turn_deg: float = 10.0
     gaps: tuple[int, ...] = (1, 2)  # frames between the pictures of a pair
@@ -54,6 +55,8 @@ class VariationSettings:
 
     def __post_init__(self) -> None:
         low, high = self.scale
+        if self.margin_px < 0:
+            raise ValueError(f"margin_px is {self.margin_px}; expected 0 or more.")
         if not 0 < low <= high:
             raise ValueError(f"scale is {self.scale}; expected two positive numbers, the smaller first.")
         if not self.gaps or min(self.gaps) < 1:
@@ -183,10 +186,13 @@ class StackedPairs:
 
 def vary(
     pair: UInt8[np.ndarray, "2 _ _ 3"], rng: np.random.Generator, settings: VariationSettings
-) -> dict[str, UInt8[np.ndarray, "2 height width 3"]]:
-    """A random cut of a pair: `clean`, for the loss, and `seen`, for the network, with other light and noise."""
-    cut = _cut(pair, rng, settings)
-    seen = cut.astype(np.float32) / 255
+) -> dict[str, UInt8[np.ndarray, "2 _ _ 3"]]:
+    """A random cut of a pair: `clean`, for the loss, and `seen`, for the network, with other light and noise.
+
+    `clean` reaches `margin_px` further than `seen` at each side.
+    """
+    cut, margin = _cut(pair, rng, settings), settings.margin_px
+    seen = cut[:, margin : margin + settings.height, margin : margin + settings.width].astype(np.float32) / 255
     seen = seen ** np.float32(np.exp(rng.uniform(-settings.gamma, settings.gamma)))
     unlike = rng.uniform(-settings.unlike, settings.unlike, (2, 1, 1, 1))
     tint = rng.uniform(-settings.tint, settings.tint, (1, 1, 1, 3))
@@ -200,17 +206,18 @@ def vary(
 def _cut(pair: np.ndarray, rng: np.random.Generator, settings: VariationSettings) -> np.ndarray:
     """Turn, scale, mirror and crop both pictures alike; either may come first."""
     _, height, width, _ = pair.shape
+    rows, columns = settings.height + 2 * settings.margin_px, settings.width + 2 * settings.margin_px
     low, high = settings.scale
     scale = np.exp(rng.uniform(np.log(low), np.log(high)))
-    scale = max(scale, settings.height / height, settings.width / width)
+    scale = max(scale, rows / height, columns / width)
     turn = np.deg2rad(rng.uniform(-settings.turn_deg, settings.turn_deg))
     # Where the cut's centre lies, such that without a turn all of it is in the picture.
-    room = np.array([width - settings.width / scale, height - settings.height / scale])
+    room = np.array([width - columns / scale, height - rows / scale])
     centre = np.array([(width - 1) / 2, (height - 1) / 2]) + (rng.uniform(size=2) - 0.5) * room
     mirror = rng.choice([-1.0, 1.0], 2)
     cosine, sine = np.cos(turn) / scale, np.sin(turn) / scale
     linear = np.array([[cosine, -sine], [sine, cosine]]) * mirror
-    corner = centre - linear @ np.array([(settings.width - 1) / 2, (settings.height - 1) / 2])
+    corner = centre - linear @ np.array([(columns - 1) / 2, (rows - 1) / 2])
     matrix = np.concatenate([linear, corner[:, None]], axis=1)
     # Shrinking skips pixels: blur first.
     sigma = 0.5 * (1 / scale - 1)
@@ -219,11 +226,7 @@ def _cut(pair: np.ndarray, rng: np.random.Generator, settings: VariationSettings
     cuts = []
     for picture in pair[order]:
         smooth = cv2.GaussianBlur(picture, (0, 0), sigma) if sigma > 0.1 else np.ascontiguousarray(picture)
-        cuts.append(
-            cv2.warpAffine(
-                smooth, matrix, (settings.width, settings.height), flags=flags, borderMode=cv2.BORDER_REFLECT_101
-            )
-        )
+        cuts.append(cv2.warpAffine(smooth, matrix, (columns, rows), flags=flags, borderMode=cv2.BORDER_REFLECT_101))
     return np.stack(cuts)
 
 

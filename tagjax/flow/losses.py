@@ -1,8 +1,9 @@
 """Losses of optical flow without labels: census, occlusion, smoothness, and a teacher's word on what is hidden.
 
 Multi-level census and forward-backward occlusion after UnFlow (Meister et al., AAAI 2018); edge-aware smoothness and
-self-supervision after UFlow (Jonschkowski et al., ECCV 2020). Functions take one pair; `jax.vmap` for batches. Masks
-carry no gradient: none could tell the network to hide what it does not explain.
+self-supervision after UFlow (Jonschkowski et al., ECCV 2020); the picture beyond a crop and sequences of estimates after
+SMURF (Stone et al., CVPR 2021). Functions take one pair; `jax.vmap` for batches. Masks carry no gradient: none could
+tell the network to hide what it does not explain.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from .._numerics import safe_sqrt
 from ..image.census import census_distance, census_offsets, to_grey
 from ..image.warp import gather, pixel_grid
-from ._layers import shrink
+from ._layers import enlarge_flow, shrink
 from .network import Levels
 
 Photometric = Literal["census", "photometric", "ssim"]
@@ -32,6 +33,7 @@ class FlowLossSettings:
     census_radius: int = 3  # pixels, at the full resolution; one less at each rougher level, down to 1
     census_stride: int = 3  # of the neighbours within the radius every n-th is compared
     level_weights: tuple[float, ...] = (1.0, 0.5, 0.4, 0.3, 0.2)  # finest first; rougher levels beyond have none
+    sequence_decay: float = 0.0  # per update of a recurrent network, which takes the place of level_weights; 0 for none
     robustness: float = 0.4  # exponent of the generalised Charbonnier function of the data term
     smooth_first: float = 1.0
     smooth_second: float = 0.0
@@ -50,12 +52,15 @@ class FlowLossSettings:
             raise ValueError(f"level_weights are {self.level_weights}; at least one positive and none negative.")
         if not 0 < self.robustness <= 1:
             raise ValueError(f"robustness is {self.robustness}; expected an exponent above 0 and at most 1.")
+        if not 0 <= self.sequence_decay <= 1:
+            raise ValueError(f"sequence_decay is {self.sequence_decay}; expected 0 (none) to 1.")
         census_offsets(self.census_radius, self.census_stride)
 
 
 def charbonnier(x: Float[Array, "*shape"], exponent: float, epsilon: float = 0.01) -> Float[Array, "*shape"]:
     """Robust penalty (|x| + epsilon)^exponent, after DDFlow and UFlow. Gradient 0 at 0."""
-    return (jnp.abs(x) + epsilon) ** exponent
+    magnitude = x * jax.lax.stop_gradient(jnp.sign(x))  # JAX's own |x| has gradient 1 at 0
+    return (magnitude + epsilon) ** exponent
 
 
 def masked_mean(values: Float[Array, "height width"], mask: Float[Array, "height width"]) -> Float[Array, ""]:
@@ -63,12 +68,20 @@ def masked_mean(values: Float[Array, "height width"], mask: Float[Array, "height
     return jnp.sum(values * mask) / (jnp.sum(mask) + 1e-6)
 
 
-def inside(flow_px: Float[Array, "height width 2"]) -> Bool[Array, "height width"]:
-    """Where the flow stays within the picture."""
+def inside(flow_px: Float[Array, "height width 2"], margin_px: int = 0) -> Bool[Array, "height width"]:
+    """Where the flow stays within the picture, or within `margin_px` around it."""
     height, width, _ = flow_px.shape
-    x, y = pixel_grid(height, width)
-    u, v = x + flow_px[..., 0], y + flow_px[..., 1]
-    return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    x, y = pixel_grid(height, width, flow_px.dtype)
+    u, v = x + flow_px[..., 0] + margin_px, y + flow_px[..., 1] + margin_px
+    return (u >= 0) & (u <= width - 1 + 2 * margin_px) & (v >= 0) & (v <= height - 1 + 2 * margin_px)
+
+
+def margin_of(crop: tuple[int, ...], whole: tuple[int, ...]) -> int:
+    """Pixels by which a whole picture reaches beyond a crop of it, alike at every side; from their shapes."""
+    margin = (whole[0] - crop[0]) // 2
+    if margin < 0 or whole[:2] != (crop[0] + 2 * margin, crop[1] + 2 * margin):
+        raise ValueError(f"A picture of {whole[:2]} pixels does not reach equally far beyond a crop of {crop[:2]}.")
+    return margin
 
 
 def inconsistency(
@@ -127,18 +140,22 @@ def data_distance(
 def data_term(
     flow_px: Float[Array, "height width 2"],
     first: Float[Array, "height width"],
-    second: Float[Array, "height width"],
+    second: Float[Array, "rows columns"],
     visible: Float[Array, "height width"],
     settings: FlowLossSettings,
     level: int = 0,
 ) -> Float[Array, ""]:
     """Mean robust distance of the first picture and the second, brought onto it, over what is visible.
 
-    The gradient reaches the flow only, not the pictures.
+    The second may reach beyond the first, alike at every side, so that what leaves a crop still teaches (SMURF's
+    full-image warping, Section 3.3). The gradient reaches the flow only, not the pictures.
     """
-    warped, _ = gather(jax.lax.stop_gradient(second)[..., None], flow_px)
+    margin = margin_of(first.shape, second.shape)
+    outer = jnp.pad(flow_px, ((margin, margin), (margin, margin), (0, 0)))
+    warped = gather(jax.lax.stop_gradient(second)[..., None], outer)[0][..., 0]
     # Outside, the first picture stands in, so that the neighbours of such pixels see no edge.
-    warped = jnp.where(inside(flow_px), warped[..., 0], first)
+    height, width = first.shape
+    warped = jnp.where(inside(flow_px, margin), warped[margin : margin + height, margin : margin + width], first)
     return masked_mean(charbonnier(data_distance(first, warped, settings, level), settings.robustness), visible)
 
 
@@ -171,35 +188,55 @@ def teaching_term(
     The student's picture is the teacher's without `border_px` at each side. No gradient to the teacher.
     """
     cut = slice(border_px, -border_px)
-    known = (~teacher_hidden[cut, cut] & student_hidden).astype(jnp.float32)
+    known = (~teacher_hidden[cut, cut] & student_hidden).astype(student_px.dtype)
     gap = student_px - jax.lax.stop_gradient(teacher_px[cut, cut])
     return jnp.sum(jnp.sum(safe_sqrt(gap * gap + 1e-6), axis=-1) * known) / known.size
+
+
+def shown(
+    flow_px: Float[Array, "height width 2"],
+    back_px: Float[Array, "height width 2"],
+    hide: Float[Array, ""],
+    settings: FlowLossSettings,
+    margin_px: int = 0,
+) -> Float[Array, "height width"]:
+    """1 where the second picture shows what the first does, 0 where not: it left, or (times `hide`) is occluded.
+
+    What leaves a crop for the margin around it has no way back to check, and counts as shown.
+    """
+    visible = inside(flow_px, margin_px).astype(flow_px.dtype)
+    if settings.occlusion:
+        hidden = occluded(flow_px, back_px, settings.occlusion_share, settings.occlusion_px2)
+        if margin_px:
+            hidden = hidden & inside(flow_px)
+        visible = visible * (1 - hide * hidden.astype(flow_px.dtype))
+    return jax.lax.stop_gradient(visible)
 
 
 def level_terms(
     forward: Levels,
     backward: Levels,
     first: Float[Array, "height width 3"],
-    second: Float[Array, "height width 3"],
+    second: Float[Array, "rows columns 3"],
     hide: Float[Array, ""],
     settings: FlowLossSettings,
 ) -> dict[str, Float[Array, ""]]:
     """Data term and smoothness summed over levels, of one direction; `hide` 1 leaves out what is occluded, 0 not.
 
-    Smoothness is asked of the last level before the learned upsampling, which follows the picture's edges by itself.
+    `second` may reach beyond `first` (`data_term`) by a multiple of the roughest level's stride. Smoothness is asked of
+    the last level before the learned upsampling, which follows the picture's edges by itself.
     """
     height = first.shape[0]
+    margin = margin_of(first.shape, second.shape)
     data, first_order, second_order = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
     hidden_share = jnp.zeros(())
     ways = list(zip(forward[::-1], backward[::-1], strict=True))
     for level, (flow, back) in enumerate(ways[: len(settings.level_weights)]):
         factor = height // flow.shape[0]
+        if margin % factor:
+            raise ValueError(f"A margin of {margin} pixels around the crop; it must be a multiple of {factor}.")
         here, there = (shrink(image, factor) if factor > 1 else image for image in (first, second))
-        visible = inside(flow).astype(jnp.float32)
-        if settings.occlusion:
-            hidden = occluded(flow, back, settings.occlusion_share, settings.occlusion_px2).astype(jnp.float32)
-            visible = visible * (1 - hide * hidden)
-        visible = jax.lax.stop_gradient(visible)
+        visible = shown(flow, back, hide, settings, margin // factor)
         if level == 0:
             hidden_share = 1 - jnp.mean(visible)
         term = data_term(flow, to_grey(here), to_grey(there), visible, settings, level)
@@ -208,6 +245,48 @@ def level_terms(
             first_order = smoothness(flow, here, settings.edge_weight, 1)
             second_order = smoothness(flow, here, settings.edge_weight, 2)
     return {"data": data, "smooth_first": first_order, "smooth_second": second_order, "hidden_share": hidden_share}
+
+
+def sequence_terms(
+    forward: Levels,
+    backward: Levels,
+    first: Float[Array, "height width 3"],
+    second: Float[Array, "rows columns 3"],
+    hide: Float[Array, ""],
+    settings: FlowLossSettings,
+) -> dict[str, Float[Array, ""]]:
+    """`level_terms` of a recurrent network: sum over its updates of decay^(last - i) times each one's (SMURF, Eq. 1).
+
+    The estimates before the last have one size, and each is enlarged to the picture's; the last estimate is the last
+    update enlarged by the network itself, and adds nothing. What is hidden is decided by the last update. Smoothness is
+    asked of each at its own size.
+    """
+    if len({flow.shape for flow in forward[:-1]}) != 1:
+        raise ValueError(
+            f"Estimates of shapes {[flow.shape for flow in forward[:-1]]}; a sequence has one shape before the last. "
+            "Set sequence_decay to 0 for a pyramid."
+        )
+    flows = jnp.stack(forward[:-1])
+    factor = first.shape[0] // flows.shape[1]
+    margin, rough = margin_of(first.shape, second.shape), shrink(first, factor)
+    grey_here, grey_there = to_grey(first), to_grey(second)
+    visible = shown(enlarge_flow(forward[-2], factor), enlarge_flow(backward[-2], factor), hide, settings, margin)
+
+    @jax.checkpoint
+    def terms(flow: Array) -> tuple[Array, Array, Array]:
+        fine = enlarge_flow(flow, factor)
+        seen = jax.lax.stop_gradient(inside(fine, margin).astype(fine.dtype) * visible)
+        data = data_term(fine, grey_here, grey_there, seen, settings)
+        return data, smoothness(flow, rough, settings.edge_weight, 1), smoothness(flow, rough, settings.edge_weight, 2)
+
+    weights = settings.sequence_decay ** jnp.arange(len(flows) - 1, -1, -1, dtype=flows.dtype)
+    data, first_order, second_order = (jnp.sum(weights * each) for each in jax.lax.map(terms, flows))
+    return {
+        "data": data,
+        "smooth_first": first_order,
+        "smooth_second": second_order,
+        "hidden_share": 1 - jnp.mean(visible),
+    }
 
 
 def weighted(terms: dict[str, Float[Array, ""]], settings: FlowLossSettings) -> Float[Array, ""]:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..config import TrainFlowConfig, build
+from ..data.picture_pairs import VariationSettings
 from ..evaluation.benchmark import machine
 from ..evaluation.report import write_json
 from ..flow.named import make_flow
@@ -50,6 +51,7 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
     console = console or Console()
     begun = time.perf_counter()
     network = make_network(config.flow)
+    _check_sizes(network, config.data.variation)
     if config.init is not None:
         network = load_weights(network, config.init)
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
@@ -108,6 +110,16 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
         console.print(f"Stopped at step {steps}; go on with hydra.run.dir={folder}")
         return float("nan")
     return found["learned"]["all"]
+
+
+def _check_sizes(network: AbstractFlowNetwork, variation: VariationSettings) -> None:
+    for name in ("height", "width", "margin_px"):
+        value = getattr(variation, name)
+        if value % network.divisor:
+            fitting = network.divisor * max(1, round(value / network.divisor))
+            raise ValueError(
+                f"data.variation.{name} is {value}; this network takes multiples of {network.divisor}: set {fitting}."
+            )
 
 
 @eqx.filter_jit

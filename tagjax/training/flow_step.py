@@ -11,7 +11,16 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PyTree, UInt8, UInt32
 
-from ..flow.losses import FlowLossSettings, level_terms, mean_terms, occluded, teaching_term, weighted
+from ..flow.losses import (
+    FlowLossSettings,
+    level_terms,
+    margin_of,
+    mean_terms,
+    occluded,
+    sequence_terms,
+    teaching_term,
+    weighted,
+)
 from ..flow.network import AbstractFlowNetwork, flow_both_ways
 
 
@@ -36,20 +45,25 @@ class FlowTrainState(eqx.Module):
 
 def pair_terms(
     network: AbstractFlowNetwork,
-    clean: Float[Array, "2 height width 3"],
+    clean: Float[Array, "2 rows columns 3"],
     seen: Float[Array, "2 height width 3"],
     hide: Float[Array, ""],
     settings: FlowLossSettings,
     *,
     teach: bool,
 ) -> dict[str, Float[Array, ""]]:
-    """Terms of the loss of one pair, both ways: flow from the varied pictures, held against the clean ones."""
-    first, second = clean[0], clean[1]
+    """Terms of the loss of one pair, both ways: flow from the varied pictures, held against the clean ones.
+
+    The clean pictures may reach beyond the varied ones, alike at every side.
+    """
+    margin, (height, width) = margin_of(seen.shape[1:], clean.shape[1:]), seen.shape[1:3]
+    first, second = (each[margin : margin + height, margin : margin + width] for each in clean)
     forward, backward = flow_both_ways(network, seen[0], seen[1])
+    terms_of = sequence_terms if settings.sequence_decay > 0 else level_terms
     terms = mean_terms(
         [
-            level_terms(forward, backward, first, second, hide, settings),
-            level_terms(backward, forward, second, first, hide, settings),
+            terms_of(forward, backward, first, clean[1], hide, settings),
+            terms_of(backward, forward, second, clean[0], hide, settings),
         ]
     )
     if not teach:
@@ -66,7 +80,7 @@ def pair_terms(
 
 def batch_loss(
     network: AbstractFlowNetwork,
-    clean: Float[Array, "batch 2 height width 3"],
+    clean: Float[Array, "batch 2 rows columns 3"],
     seen: Float[Array, "batch 2 height width 3"],
     step: Int[Array, ""],
     settings: FlowLossSettings,
@@ -90,7 +104,7 @@ def batch_loss(
 
 @eqx.filter_jit(donate="all-except-first")
 def _update(
-    pictures: tuple[UInt8[Array, "batch 2 height width 3"], UInt8[Array, "batch 2 height width 3"]],
+    pictures: tuple[UInt8[Array, "batch 2 rows columns 3"], UInt8[Array, "batch 2 height width 3"]],
     state: FlowTrainState,
     optimizer: optax.GradientTransformation,
     settings: FlowLossSettings,
