@@ -52,13 +52,11 @@ from tagjax.baselines.goller._evaluate import interval, outcomes, rates, thresho
 from tagjax.baselines.goller._fit import true_states
 from tagjax.baselines.goller._reads import grid_statistic, rssi_frames
 from tagjax.baselines.goller._site import level_site
-from tagjax.baselines.goller._system import Calibration
+from tagjax.baselines.goller._system import Calibration, empty_picture
 from tagjax.baselines.goller.run import GollerConfig, run_goller, scenario_paths
 from tagjax.config import from_mapping
 from tagjax.data.store import open_recording, save_recording
 from tagjax.recording import Intrinsics, Recording, RecordingError, TagReads, Truth
-
-pytestmark = pytest.mark.slow  # with compiling, more than the default run has time for
 
 RNG = np.random.default_rng(0)
 
@@ -115,7 +113,7 @@ def test_a_tag_heard_by_nobody_has_no_likelihood_and_finite_gradients():
         weights = antenna_weights(rssi, jnp.zeros(3, bool), scale)
         return jnp.sum(mixture_likelihood(model, weights, points))
 
-    value, gradient = jax.value_and_grad(total, argnums=(0, 1))(jnp.full(3, -jnp.inf), jnp.asarray(4.0))
+    value, gradient = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))(jnp.full(3, -jnp.inf), jnp.asarray(4.0))
     assert value == 0
     assert all(np.isfinite(np.asarray(g)).all() for g in gradient)
 
@@ -178,6 +176,9 @@ def _location(**settings: float):
 FLOOR = make_grid((-2.0, -1.6), (6.2, 1.6), 0.4)
 
 
+_locate = jax.jit(locate)
+
+
 def _times(num: int) -> jax.Array:
     return jnp.arange(num, dtype=jnp.float32) * 0.1
 
@@ -189,14 +190,14 @@ def _rssi(path: np.ndarray) -> np.ndarray:
 def test_a_tag_that_one_antenna_hears_is_where_that_antenna_is():
     time_s = _times(20)
     heard = jnp.zeros((20, 3), bool).at[:, 2].set(True)
-    path = locate(_location(), FLOOR, time_s, jnp.full((20, 3), -60.0), heard)
+    path = _locate(_location(), FLOOR, time_s, jnp.full((20, 3), -60.0), heard)
     assert np.abs(np.asarray(path.position_m[-1]) - MEANS[2]).max() < 0.25
     assert bool(path.known.all())
 
 
 def test_a_tag_that_is_never_heard_is_anywhere_and_still():
     time_s = _times(5)
-    path = locate(_location(), FLOOR, time_s, jnp.zeros((5, 3)), jnp.zeros((5, 3), bool))
+    path = _locate(_location(), FLOOR, time_s, jnp.zeros((5, 3)), jnp.zeros((5, 3), bool))
     np.testing.assert_allclose(path.position_m, np.broadcast_to([2.1, 0.0], (5, 2)), atol=1e-4)
     # The standard deviation of a uniform belief over the grid's cells.
     np.testing.assert_allclose(path.std_m[0, 0], np.std(np.asarray(FLOOR.x_m)), rtol=1e-3)
@@ -208,32 +209,32 @@ def test_a_walk_along_the_antennas_is_followed_and_a_still_tag_is_not_moving():
     time_s = np.arange(60) * 0.1
     walk = np.stack([4.5 - 0.8 * time_s, np.zeros(60)], axis=-1)
     everywhere = jnp.ones((60, 3), bool)
-    run = jax.jit(locate)
-    path = run(_location(), FLOOR, jnp.asarray(time_s), jnp.asarray(_rssi(walk)), everywhere)
+    path = _locate(_location(), FLOOR, jnp.asarray(time_s), jnp.asarray(_rssi(walk)), everywhere)
     middle = slice(15, 50)
     assert np.abs(np.asarray(path.position_m[middle, 0]) - walk[middle, 0]).mean() < 0.6
     assert -1.2 < float(path.velocity_m_s[middle, 0].mean()) < -0.3
-    still = run(_location(), FLOOR, jnp.asarray(time_s), jnp.asarray(_rssi(walk[:1].repeat(60, 0))), everywhere)
+    still = _locate(_location(), FLOOR, jnp.asarray(time_s), jnp.asarray(_rssi(walk[:1].repeat(60, 0))), everywhere)
     assert np.abs(np.asarray(still.velocity_m_s[30:])).max() < 0.05
 
 
 def test_without_reads_a_belief_only_widens():
     heard = jnp.zeros((30, 3), bool).at[:5].set(True)
     walk = np.broadcast_to(MEANS[1], (30, 2))
-    path = locate(_location(), FLOOR, _times(30), jnp.asarray(_rssi(walk)), heard)
+    path = _locate(_location(), FLOOR, _times(30), jnp.asarray(_rssi(walk)), heard)
     std = np.asarray(path.std_m[:, 0])
     assert np.all(np.diff(std[4:]) > 0)
     np.testing.assert_array_equal(path.heard, [True] * 5 + [False] * 25)
 
 
 def test_one_frame_and_frames_at_one_time_are_finite():
-    single = locate(_location(), FLOOR, jnp.zeros(1), jnp.full((1, 3), -60.0), jnp.ones((1, 3), bool))
-    same = locate(_location(), FLOOR, jnp.zeros(3), jnp.full((3, 3), -60.0), jnp.ones((3, 3), bool))
+    single = _locate(_location(), FLOOR, jnp.zeros(1), jnp.full((1, 3), -60.0), jnp.ones((1, 3), bool))
+    same = _locate(_location(), FLOOR, jnp.zeros(3), jnp.full((3, 3), -60.0), jnp.ones((3, 3), bool))
     for path in (single, same):
         assert np.isfinite(np.asarray(path.position_m)).all()
         np.testing.assert_array_equal(path.velocity_m_s, np.zeros_like(path.velocity_m_s))
 
 
+@pytest.mark.slow
 def test_gradients_of_the_location(gradients_agree):
     grid = make_grid((-1.0, -1.0), (5.0, 1.0), 1.0)
     heard = jnp.asarray(RNG.random((6, 3)) < 0.7).at[0].set(True)
@@ -392,12 +393,12 @@ def test_wild_observations_stay_finite_and_decide_nothing():
     held = lambda m, t, v: associate(  # noqa: E731
         m, _times(3), t, v, jnp.ones(3, bool), jnp.zeros((3, 2, 2)), jnp.tile(jnp.asarray([1, 2]), (3, 1))
     )
-    found = held(model, tag, tag)
+    found = jax.jit(held)(model, tag, tag)
     np.testing.assert_allclose(found.probability, 1 / 3, rtol=1e-3)
-    gradient = jax.grad(lambda *x: jnp.sum(held(*x).log_evidence), argnums=(0, 1, 2))(model, tag, tag)
+    gradient = jax.jit(jax.grad(lambda *x: jnp.sum(held(*x).log_evidence), argnums=(0, 1, 2)))(model, tag, tag)
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(gradient))
     zero = jnp.zeros((3, 2))
-    gradient = jax.grad(lambda *x: held(*x).probability[-1, 1], argnums=(0, 1, 2))(model, zero, zero)
+    gradient = jax.jit(jax.grad(lambda *x: held(*x).probability[-1, 1], argnums=(0, 1, 2)))(model, zero, zero)
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(gradient))
 
 
@@ -670,7 +671,7 @@ def test_rssi_means_are_those_of_the_period():
 def _track(recording: Recording, settings: BlobSettings, warm: bool = True):
     tracker = BlobTracker(settings, find_site(recording), recording.intrinsics)
     if warm:
-        tracker.warm_up(np.median(recording.colour, axis=0).astype(np.uint8))
+        tracker.warm_up(empty_picture(recording))
     times = recording.frame_time_s()
     return [
         tracker.step(recording.colour[t], recording.depth_metres(t), float(times[t]))
@@ -711,11 +712,32 @@ def test_a_camera_along_the_room_finds_feet_and_cut_off_people():
     nothing = np.zeros((120, 160))
     (u, foot), (_, head) = pixel([3.0, 0.2, 0.0]), pixel([3.0, 0.2, 1.7])
     box = (round(u) - 8, round(head), 17, round(foot) - round(head) + 1)
-    np.testing.assert_allclose(tracker.place(box, nothing > 0, nothing), [3.0, 0.2], atol=0.06)
+    place = tracker.place(box, nothing > 0, nothing)
+    assert place is not None
+    np.testing.assert_allclose(place, [3.0, 0.2], atol=0.06)
     u, head = pixel([0.3, -0.2, 1.7])
     assert pixel([0.3, -0.2, 0.0])[1] > 120
     box = (round(u) - 20, round(head), 41, 120 - round(head))
-    np.testing.assert_allclose(tracker.place(box, nothing > 0, nothing), [0.3, -0.2], atol=0.06)
+    place = tracker.place(box, nothing > 0, nothing)
+    assert place is not None
+    np.testing.assert_allclose(place, [0.3, -0.2], atol=0.06)
+
+
+def test_the_empty_picture_has_nobody_in_it_even_where_people_are_for_half_of_the_time():
+    num = 60
+    walk = straight((4.6, 0.3), (-1.6, 0.3), num_frames=num)
+    recording = drawn_shop({"a": walk}, {}, num_frames=num)
+    clean = np.asarray(drawn_shop({}, {"x": (0.0, 0.0)}, num_frames=1, seed=9).colour)[0].astype(float)
+    crowded = np.array(recording.colour)
+    # Whatever passes there is of many colours; the floor shows for less than half of the time.
+    crowded[1::2, 40:60, 20:40] = np.random.default_rng(1).integers(0, 255, (num // 2, 20, 20, 3))
+    crowded[:6, 40:60, 20:40] = 250
+    for pictures in (recording.colour, crowded):
+        found = empty_picture(dataclasses.replace(recording, colour=pictures)).astype(float)
+        assert np.abs(found - clean).mean() < 3.0
+        assert np.mean(np.abs(found - clean).max(axis=-1) > 20) < 0.005
+    one = dataclasses.replace(recording, colour=crowded[:1], depth=recording.depth[:1], time_ns=recording.time_ns[:1])
+    np.testing.assert_array_equal(empty_picture(one), crowded[0])
 
 
 def test_who_crosses_keeps_the_name():
@@ -776,6 +798,13 @@ def test_slots_keep_their_blob_and_count_what_does_not_fit():
 # The whole
 
 
+def _beyond_the_line(walk: np.ndarray) -> np.ndarray:
+    """Frames of a walker's first metre of the exit region."""
+    frames = np.flatnonzero((walk[:, 0] < 0.0) & (walk[:, 0] > -1.0))
+    assert len(frames) > 8
+    return frames
+
+
 def test_the_leaver_is_alarmed_and_still_tags_are_not(shop, calibration):
     seen = observe(shop, LOOKING_DOWN)
     decision = decide(calibration, seen, LOOKING_DOWN)
@@ -785,10 +814,16 @@ def test_the_leaver_is_alarmed_and_still_tags_are_not(shop, calibration):
     assert score["near"] < 0.2
     states = true_states(seen, carried(shop))
     leaver = seen.epcs.index("leaver")
-    right = np.take_along_axis(np.asarray(decision.probability[leaver]), np.maximum(states[leaver], 0)[:, None], 1)[
-        :, 0
-    ]
-    assert right[states[leaver] >= 0][5:].mean() > 0.8
+    best = np.argmax(np.asarray(decision.probability[leaver]), axis=1)
+    # Location by proximity rests at each antenna until the next one is the stronger: there a walker's tag counts as
+    # background (Eq. 4). Beyond the line, where alarms are due, it has just come off the last but one.
+    beyond = _beyond_the_line(straight((4.6, 0.3), (-1.6, 0.3)))
+    assert np.all(states[leaver][beyond] > 0)
+    np.testing.assert_array_equal(best[beyond], states[leaver][beyond])
+    speed = np.linalg.norm(np.asarray(decision.location.velocity_m_s[leaver]), axis=1)
+    resting = (states[leaver] > 0) & (speed < 0.3)
+    assert resting.sum() > 5
+    assert not best[resting].any()
     found = outcomes(calibration, "sp_st_still", seen, carried(shop), LOOKING_DOWN)
     counted = rates(found, "fused", 0.5)
     assert (counted.num_runs, counted.num_leaves, counted.num_still, counted.num_stays) == (1, 1, 2, 0)
@@ -835,9 +870,9 @@ def test_more_tags_than_blobs_share_one_and_blobs_without_tags_are_nobodys(calib
     best = np.argmax(np.asarray(decision.probability), axis=2)
     assert seen.epcs == ("a", "b")
     assert np.mean(best[0] == best[1]) > 0.95
-    late = slice(40, 60)
+    beyond = _beyond_the_line(walk)
     carrier = np.argmin(np.linalg.norm(seen.blobs.position_m[50] - walk[50], axis=1))
-    assert np.mean(best[:, late] == 1 + carrier) > 0.9
+    np.testing.assert_array_equal(best[:, beyond], 1 + carrier)
 
 
 def test_no_tags_and_no_blobs_are_defined(shop, calibration):
@@ -938,6 +973,7 @@ def test_without_calibration_it_says_what_to_do(shop, tmp_path):
         carried(dataclasses.replace(shop, truth=None))
 
 
+@pytest.mark.slow
 def test_fitting_lowers_the_loss_and_leaves_the_antennas(shop, calibration):
     examples = [(observe(shop, LOOKING_DOWN), carried(shop))]
     fitted, losses = fit_association(calibration, examples, LOOKING_DOWN, num_steps=12, learning_rate=0.1)
@@ -952,6 +988,7 @@ def test_fitting_lowers_the_loss_and_leaves_the_antennas(shop, calibration):
 # As a tracer
 
 
+@pytest.mark.slow
 def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
     tracer = GollerTracer(calibration, LOOKING_DOWN).at(shop)
     said = list(host_trace(tracer, shop))
@@ -969,7 +1006,7 @@ def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
             overlap.append((mask & truth).sum() / (mask | truth).sum())
             place = find_site(shop).to_room(trace.centre_m[leaver][None].astype(float))[0]
             assert place[2] == pytest.approx(0.85, abs=0.01)
-    assert len(overlap) > 30
+    assert len(overlap) > 25
     assert np.mean(overlap[3:-10]) > 0.7
     assert not any(trace.found[seen.epcs.index("shelf")] for _, trace in said[10:])
 
@@ -1021,6 +1058,7 @@ def test_the_configuration_names_every_setting():
     assert set(values["settings"]["blobs"]) == names(BlobSettings)
 
 
+@pytest.mark.slow
 def test_a_run_writes_tables_metrics_and_plots(tmp_path):
     save_recording(_grid_recording(), tmp_path / "grid.zarr")
     leaves, stays = straight((4.6, 0.3), (-1.6, 0.3)), straight((4.6, 0.3), (2.4, 0.3))

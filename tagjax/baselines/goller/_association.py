@@ -22,10 +22,10 @@ class AssociationModel(eqx.Module):
 
 def make_association(
     *,
-    distance_m: tuple[float, float] = (0.7, 1.0),
-    speed_m_s: float = 0.4,
-    switch_hz: float = 0.1,
-    clutter: float = 1e-3,
+    distance_m: tuple[float, float] = (0.8, 0.6),
+    speed_m_s: float = 0.6,
+    switch_hz: float = 0.05,
+    clutter: float = 3e-3,
 ) -> AssociationModel:
     """An `AssociationModel` from plain values, which must be positive."""
     values = {"speed_m_s": speed_m_s, "switch_hz": switch_hz, "clutter": clutter}

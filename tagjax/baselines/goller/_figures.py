@@ -30,38 +30,42 @@ def _figure(width: float, height: float) -> Figure:
 
 def antenna_plot(path: Path, statistic: GridStatistic, model: AntennaModel) -> None:
     """Measured RSSI at the grid's places beside the fitted Gaussian of each antenna (Figs. 9 and 10)."""
-    num = model.mean_m.shape[0]
-    figure = _figure(3.2 * num + 1, 6.5)
-    measured = np.where(np.isfinite(statistic.mean_dbm), statistic.mean_dbm, float(model.floor_dbm))
+    num, floor_dbm = model.mean_m.shape[0], float(model.floor_dbm)
+    figure = _figure(3.2 * num + 1, 4.6)
+    heard = np.isfinite(statistic.mean_dbm)
+    measured = np.where(heard, statistic.mean_dbm, floor_dbm)
     low, high = statistic.position_m.min(axis=0) - 0.3, statistic.position_m.max(axis=0) + 0.3
     axes_x, axes_y = np.linspace(low[0], high[0], 80), np.linspace(low[1], high[1], 50)
     x, y = np.meshgrid(axes_x, axes_y)
     points = jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), jnp.float32)
-    modelled = np.asarray(jax.vmap(lambda point: response_db(model, point))(points)) + float(model.floor_dbm)
-    grid = np.atleast_2d(figure.subplots(2, num, sharey="row", squeeze=False))
-    limits = (float(model.floor_dbm), float(np.max(measured)))
+    modelled = np.asarray(jax.vmap(lambda point: response_db(model, point))(points)) + floor_dbm
+    grid = np.atleast_2d(figure.subplots(2, num, sharex=True, sharey="row", squeeze=False, height_ratios=[1.0, 1.5]))
+    levels = np.arange(floor_dbm, max(float(measured.max()), float(modelled.max())) + 2.0, 2.0)
+    shown = {"cmap": "viridis", "vmin": levels[0], "vmax": levels[-1]}
+    shades = None
     for antenna in range(num):
-        upper, lower = grid[0, antenna], grid[1, antenna]
-        shades = upper.contourf(
-            x, y, modelled[:, antenna].reshape(x.shape), 12, cmap="viridis", vmin=limits[0], vmax=limits[1]
-        )
-        dots = {"cmap": "viridis", "vmin": limits[0], "vmax": limits[1], "edgecolors": "w", "s": 45}
-        upper.scatter(statistic.position_m[:, 0], statistic.position_m[:, 1], c=measured[:, antenna], **dots)
+        upper, lower, there = grid[0, antenna], grid[1, antenna], heard[:, antenna]
+        shades = upper.contourf(x, y, modelled[:, antenna].reshape(x.shape), levels, **shown)
+        places = statistic.position_m
+        upper.scatter(*places[there].T, c=measured[there, antenna], edgecolors="w", s=45, **shown)
+        upper.plot(*places[~there].T, "x", color="0.8", markersize=5)
         upper.plot(*np.asarray(model.mean_m[antenna]), "r+", markersize=12)
-        upper.set(title=f"antenna {antenna + 1}: dots measured, field modelled", xlabel="x (m)", aspect="equal")
-        upper.title.set_fontsize(8)
-        along = np.abs(statistic.position_m[:, 1]) < 0.5
-        lower.plot(statistic.position_m[along, 0], measured[along, antenna], "k.", label="measured, |y| < 0.5 m")
+        upper.set(aspect="equal")
+        upper.set_title(f"antenna {antenna + 1}", fontsize=9)
+        along = np.abs(places[:, 1]) < 0.5
+        lower.plot(places[along & there, 0], measured[along & there, antenna], "k.", label="measured, |y| < 0.5 m")
+        lower.plot(places[along & ~there, 0], measured[along & ~there, antenna], "x", color="0.5", label="not heard")
         line = jnp.asarray(np.stack([axes_x, np.zeros_like(axes_x)], axis=-1), jnp.float32)
-        bell = np.asarray(jax.vmap(lambda point: response_db(model, point))(line))[:, antenna] + float(model.floor_dbm)
-        lower.plot(axes_x, bell, "r", label="Gaussian")
+        bell = np.asarray(jax.vmap(lambda point: response_db(model, point))(line))[:, antenna] + floor_dbm
+        lower.plot(axes_x, bell, "r", label="Gaussian, y = 0")
         lower.set(xlabel="x (m)")
         lower.grid(alpha=0.3)
-        if antenna == num - 1:
-            figure.colorbar(shades, ax=upper, label="RSSI (dBm)")
+    figure.suptitle("RSSI of the tag grid: dots measured, crosses not heard, field modelled", fontsize=9)
+    figure.colorbar(shades, ax=grid[0].tolist(), label="dBm", aspect=10)
     grid[0, 0].set_ylabel("y (m)")
     grid[1, 0].set_ylabel("RSSI (dBm)")
-    grid[1, 0].legend(fontsize=7)
+    # Its curve leaves the most room.
+    grid[1, 0].legend(fontsize=7, loc="upper right")
     figure.savefig(path, dpi=110)
 
 
@@ -101,7 +105,7 @@ def association_plot(
 
     `state` is the right one (0 background, 1 + slot, -1 not known). Below, the tag's located x.
     """
-    figure = _figure(8, 5)
+    figure = _figure(8.0, 5.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
     names = [name for name in dict.fromkeys(identity.ravel().tolist()) if name]
     true_name = np.where(

@@ -54,7 +54,7 @@ def make_location(
     scale_db: float = POWER_SCALE_DB,
     walk_m2_s: float = 1.0,
     gain_hz: float = 8.0,
-    lag_s: float = 0.5,
+    lag_s: float = 0.8,
 ) -> LocationModel:
     """A `LocationModel` from plain values, which must be positive."""
     values = {"scale_db": scale_db, "walk_m2_s": walk_m2_s, "gain_hz": gain_hz, "lag_s": lag_s}

@@ -84,7 +84,7 @@ class GollerTracer(AbstractHostTracer):
             raise ValueError("A tracer sees no depth: blobs.position is 'depth'; expected 'foot' or 'centre'.")
 
     def at(self, recording: Recording) -> GollerTracer:
-        """This tracer, commissioned for a recording's site: its floor by depth, and its median as the empty picture."""
+        """This tracer, commissioned for a recording's site: its floor by depth, and its `empty_picture`."""
         return GollerTracer(self.calibration, self.settings, site=find_site(recording), empty=empty_picture(recording))
 
     def inapplicable(self, recording: Recording) -> str | None:
