@@ -21,7 +21,6 @@ from tagjax.flow.losses import (
     inside,
     level_terms,
     margin_of,
-    mean_terms,
     occluded,
     sequence_terms,
     shown,
@@ -410,8 +409,6 @@ def test_the_terms_are_summed_over_levels_by_their_weights():
     total = weighted({**found, "teaching": jnp.asarray(2.0)}, SETTINGS)
     parts = (found["data"], found["smooth_first"], 0.3 * found["smooth_second"], 0.2 * 2.0)
     assert float(total) == pytest.approx(sum(map(float, parts)), rel=1e-6)
-    means = mean_terms([{"data": jnp.asarray(1.0)}, {"data": jnp.asarray(4.0)}])
-    assert float(means["data"]) == 2.5
 
 
 def test_jit_agrees_with_eager_and_vmap_with_a_loop():

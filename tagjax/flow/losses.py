@@ -9,7 +9,6 @@ tell the network to hide what it does not explain.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Literal
 
 import jax
@@ -294,8 +293,3 @@ def weighted(terms: dict[str, Float[Array, ""]], settings: FlowLossSettings) -> 
     total = terms["data"] + settings.smooth_first * terms["smooth_first"]
     total = total + settings.smooth_second * terms["smooth_second"]
     return total + settings.self_supervision * terms.get("teaching", jnp.zeros(()))
-
-
-def mean_terms(parts: Sequence[dict[str, Float[Array, ""]]]) -> dict[str, Float[Array, ""]]:
-    """Term by term, the mean of several."""
-    return {name: sum((part[name] for part in parts), jnp.zeros(())) / len(parts) for name in parts[0]}

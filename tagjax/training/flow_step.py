@@ -15,7 +15,6 @@ from ..flow.losses import (
     FlowLossSettings,
     level_terms,
     margin_of,
-    mean_terms,
     occluded,
     sequence_terms,
     teaching_term,
@@ -60,12 +59,10 @@ def pair_terms(
     first, second = (each[margin : margin + height, margin : margin + width] for each in clean)
     forward, backward = flow_both_ways(network, seen[0], seen[1])
     terms_of = sequence_terms if settings.sequence_decay > 0 else level_terms
-    terms = mean_terms(
-        [
-            terms_of(forward, backward, first, clean[1], hide, settings),
-            terms_of(backward, forward, second, clean[0], hide, settings),
-        ]
-    )
+    # Mapped, not written twice: less to compile.
+    ways = [jax.tree.map(lambda *way: jnp.stack(way), *order) for order in ((forward, backward), (backward, forward))]
+    both = jax.vmap(lambda there, back, here, other: terms_of(there, back, here, other, hide, settings))
+    terms = jax.tree.map(jnp.mean, both(ways[0], ways[1], jnp.stack([first, second]), clean[::-1]))
     if not teach:
         return {**terms, "teaching": jnp.zeros(())}
     border = settings.self_supervision_border_px

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jax
@@ -42,7 +43,7 @@ def antenna_plot(path: Path, statistic: GridStatistic, model: AntennaModel) -> N
     grid = np.atleast_2d(figure.subplots(2, num, sharex=True, sharey="row", squeeze=False, height_ratios=[1.0, 1.5]))
     levels = np.arange(floor_dbm, max(float(measured.max()), float(modelled.max())) + 2.0, 2.0)
     shown = {"cmap": "viridis", "vmin": levels[0], "vmax": levels[-1]}
-    shades = None
+    shades: Any = None
     for antenna in range(num):
         upper, lower, there = grid[0, antenna], grid[1, antenna], heard[:, antenna]
         shades = upper.contourf(x, y, modelled[:, antenna].reshape(x.shape), levels, **shown)
