@@ -43,8 +43,6 @@ from tagjax.evaluation.tagvision import (
     run_tagvision,
 )
 
-pytestmark = pytest.mark.slow  # with compiling, more than the default run has time for
-
 C = 299_792_458.0
 SIGMA = 0.1 * np.sqrt(2.0)
 ROOT = Path(__file__).parents[1]
@@ -396,6 +394,7 @@ def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
         dataclasses.replace(config, split="all")
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_planar_tracks_run_whole(tmp_path: Path) -> None:
     values = _compose(

@@ -37,8 +37,6 @@ from tagjax.evaluation.tagvision import (
 )
 from tagjax.recording import Intrinsics
 
-pytestmark = pytest.mark.slow  # with compiling, more than the default run has time for
-
 ROOT = Path(__file__).parents[1]
 
 

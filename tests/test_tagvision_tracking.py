@@ -30,8 +30,6 @@ from tagjax.evaluation.tagvision import (
 from tagjax.recording import Recording, RecordingError, TagReads
 from tagjax.tagattention_paper import TagAttentionPaper
 
-pytestmark = pytest.mark.slow  # with compiling, more than the default run has time for
-
 QUICK = MatchSettings(num_rounds=20)
 
 
