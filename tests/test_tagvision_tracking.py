@@ -28,7 +28,6 @@ from tagjax.evaluation.tagvision import (
     overhead,
 )
 from tagjax.recording import Recording, RecordingError, TagReads
-from tagjax.tagattention_paper import TagAttentionPaper
 
 QUICK = MatchSettings(num_rounds=20)
 
@@ -180,15 +179,11 @@ def test_the_system_finds_names_and_outlines_what_is_tagged(drawn: Recording, sa
     assert np.corrcoef(steps, true_steps)[0, 1] > 0.7
 
 
-def test_it_is_scored_by_the_same_code(drawn: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    def on_host(tracer, recording, load, *, epcs, settings, frames):
-        return host_trace(load(), recording, epcs=epcs, frames=frames)
-
-    monkeypatch.setattr(evaluate, "trace_recording", on_host)
+def test_it_is_scored_by_the_same_code(drawn: Recording) -> None:
     settings = evaluate.ScoreSettings(moved_for_s=1.0, num_pictures=1)
-    result = evaluate.evaluate_recording(
-        TagAttentionPaper(), drawn, lambda: TagVision(scenes.OVER, SYSTEM), stride=1, settings=settings
-    )
+    names = drawn.resolve_epcs(None)
+    traces = host_trace(TagVision(scenes.OVER, SYSTEM), drawn, epcs=names)
+    result = evaluate.score_traces(traces, drawn, names, settings=settings)
     scores = result.scores().result()
     assert (scores["iou"] or 0) > 0.7
     assert (scores["identification"] or 0) > 0.95

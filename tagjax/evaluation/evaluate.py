@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import cv2
@@ -175,6 +175,22 @@ def evaluate_recording(
     """
     settings = settings or ScoreSettings()
     names = recording.resolve_epcs(epcs)
+    said = trace_recording(tracer, recording, load, epcs=names, settings=settings, frames=frames)
+    return score_traces(said, recording, names, stride=stride, settings=settings, frames=frames, on_frame=on_frame)
+
+
+def score_traces(
+    traces: Iterable[tuple[int, Trace]],
+    recording: Recording,
+    names: Sequence[str],
+    *,
+    stride: int = 1,
+    settings: ScoreSettings | None = None,
+    frames: tuple[int, int] | None = None,
+    on_frame: Callable[[], None] | None = None,
+) -> RecordingResult:
+    """`evaluate_recording` of what any tracer says, frame by frame, of the tags `names` (`trace_recording`)."""
+    settings = settings or ScoreSettings()
     first, last = frames or (0, recording.num_frames)
     height, width = recording.image_shape
     truth = recording.truth
@@ -184,7 +200,7 @@ def evaluate_recording(
     kept = set(np.linspace(first, last - 1, settings.num_pictures).astype(int).tolist())
     rows: dict[str, list[tuple[Any, ...]]] = {epc: [] for epc in scored}
     pictures: list[Picture] = []
-    for number, said in trace_recording(tracer, recording, load, epcs=names, settings=settings, frames=(first, last)):
+    for number, said in traces:
         boxes = box_to_picture(np.asarray(said.box_px), stride, height, width)
         masks = {
             tag: mask_to_picture(np.asarray(said.mask[tag]), stride, height, width) >= settings.mask_level
