@@ -18,7 +18,7 @@ import synthetic_clips as synthetic
 
 from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
-from tagjax.training.loop import LoopSettings, train
+from tagjax.training.loop import DivergedError, LoopSettings, train
 from tagjax.training.loss import (
     ObjectiveSettings,
     agreement,
@@ -227,6 +227,33 @@ def test_resuming_is_exact_bit_for_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
     lines = [(tmp_path / name / "metrics.jsonl").read_text() for name in ("straight", "broken")]
     assert lines[0] == lines[1]
+
+
+def test_a_run_that_diverges_stops_and_names_the_last_good_checkpoint(tmp_path: Path) -> None:
+    state, _ = _fresh()
+    asked: list[int] = []
+
+    def update(state: TrainState, clips: Sequence[Any]) -> tuple[TrainState, dict[str, float]]:
+        step = int(state.step) + 1
+        asked.append(step)
+        bad = step == 3 or step > 5  # one that passes, then no end of it
+        return eqx.tree_at(lambda s: s.step, state, state.step + 1), {"loss": float(step), "skipped": float(bad)}
+
+    with Checkpoints(tmp_path / "checkpoints") as checkpoints:
+        with pytest.raises(DivergedError, match=r"in 3 steps in a row, up to step 8; the last good checkpoint is step 4"):
+            train(
+                state,
+                synthetic.ClipCycle([synthetic.recording(40)]),
+                update=update,
+                settings=LoopSettings(20, checkpoint_every=2, validate_every=20, stop_after_skipped=3, progress=False),
+                logger=Logger(tmp_path, LoggerSettings(mode="disabled")),
+                checkpoints=checkpoints,
+            )
+        assert 4 in checkpoints.steps()
+    assert asked == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[-1])["skipped"] == 1.0
+    with pytest.raises(ValueError, match="stop_after_skipped is 0"):
+        LoopSettings(stop_after_skipped=0)
 
 
 def test_metrics_of_steps_done_again_are_dropped(tmp_path: Path) -> None:

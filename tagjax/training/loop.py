@@ -39,7 +39,17 @@ class LoopSettings:
     checkpoint_every: int = 7
     validate_every: int = 7
     log_every: int = 1
+    stop_after_skipped: int = 5  # steps without a finite gradient, one after the other
     progress: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("num_steps", "batch_size", "checkpoint_every", "validate_every", "log_every", "stop_after_skipped"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"loop.{name} is {getattr(self, name)}; expected at least 1.")
+
+
+class DivergedError(RuntimeError):
+    """Training was stopped: several steps in a row had no finite loss or gradient."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +92,13 @@ def train(
     after_step: Callable[[StateT], None] | None = None,
     shown: Sequence[str] = ("loss", "own_coherence"),
 ) -> Trained[StateT]:
-    """Train from `state.step` to `num_steps`; a checkpoint is written at the end whatever ends it.
+    """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C ends it.
 
     `update` does one step on `batch_size` samples and gives numbers to log; `shown` names those beside the progress
     bar. `validate` gives numbers that are logged under `validation/`; `after_step` is called after every step.
+
+    A step whose `skipped` is 1 changed nothing. Raises `DivergedError` after `stop_after_skipped` of them in a row; it
+    names the last checkpoint written before the first of them.
     """
     columns = (
         TextColumn("[bold]train"),
@@ -96,12 +109,16 @@ def train(
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    done = int(state.step)
+    done, skipped = int(state.step), 0
     with _stop_on_interrupt() as stop_asked, Progress(*columns, disable=not settings.progress) as progress:
         task = progress.add_task("train", total=settings.num_steps, completed=done, numbers="compiling")
         while done < settings.num_steps and not stop_asked():
             state, numbers = update(state, [next(samples) for _ in range(settings.batch_size)])
             done += 1
+            skipped = skipped + 1 if numbers.get("skipped", 0.0) > 0 else 0
+            if skipped == settings.stop_after_skipped:
+                logger.write(done, numbers)
+                raise DivergedError(_diverged(checkpoints, done, skipped))
             if done % settings.log_every == 0 or done == settings.num_steps:
                 logger.write(done, numbers)
             if validate is not None and (done % settings.validate_every == 0 or done == settings.num_steps):
@@ -117,3 +134,12 @@ def train(
             jax.block_until_ready(state.step)
             checkpoints.save(state, samples.get_state())
     return Trained(state, done < settings.num_steps)
+
+
+def _diverged(checkpoints: Checkpoints, done: int, skipped: int) -> str:
+    good = [step for step in checkpoints.steps() if step <= done - skipped]
+    there = f"the last good checkpoint is step {good[-1]} in {checkpoints.folder}" if good else "no checkpoint is good"
+    return (
+        f"The loss or its gradient was not finite in {skipped} steps in a row, up to step {done}; {there}. Go on from there "
+        "with a smaller learning rate or clip_norm, and look at the data of these steps."
+    )
