@@ -235,6 +235,19 @@ def test_every_suite_finds_room_for_its_story(path):
         stage_item(item).world.check()
 
 
+@pytest.mark.parametrize("number", [0, 7, 19])
+def test_trains_of_like_phase_differ_by_half_a_wavelength_in_range(number):
+    suite = _named("half_wavelength")
+    item = next(item for item in suite.items() if item.split == "test" and item.number == number)
+    capture = dataclasses.replace(suite.capture, width=32, frame_rate_hz=3.0)
+    truth = film(stage_item(item), capture, seed=item.seed, name=item.name).truth
+    assert truth is not None
+    one, other = (np.asarray(range_m) for range_m in truth.tag_range_m.values())
+    # Half a wavelength of the band's middle, 915 MHz, is 164 mm.
+    assert np.abs(np.abs(one - other) - 0.164).max() < 0.01
+    assert np.ptp(one) > 0.05
+
+
 def test_a_glance_shows_the_worlds_of_the_suite():
     suite = _named("velocity_threshold")
     glance = suite.glance()

@@ -240,7 +240,9 @@ def test_a_run_that_diverges_stops_and_names_the_last_good_checkpoint(tmp_path: 
         return eqx.tree_at(lambda s: s.step, state, state.step + 1), {"loss": float(step), "skipped": float(bad)}
 
     with Checkpoints(tmp_path / "checkpoints") as checkpoints:
-        with pytest.raises(DivergedError, match=r"in 3 steps in a row, up to step 8; the last good checkpoint is step 4"):
+        with pytest.raises(
+            DivergedError, match=r"in 3 steps in a row, up to step 8; the last good checkpoint is step 4"
+        ):
             train(
                 state,
                 synthetic.ClipCycle([synthetic.recording(40)]),

@@ -36,17 +36,24 @@ def tabletop(
     """Toy trains on a table top of 1.5 x 3 m, seen from the ceiling.
 
     `tracks`: "loops" (rounded closed tracks, one each), "parallel" (straight lines `spacing_m` apart, the same motion),
-    "curves" (open curves over the table). Tunnels hide every train so that the camera sees it `num_traces` times, each
-    a stretch of its own. `antenna`: "ceiling" beside the camera, or "side", at the table's edge and height.
+    "ranges" (straight lines away from below the antenna, to either side, with distances to it that differ by `spacing_m`
+    at all times), "curves" (open curves over the table). Tunnels hide every train so that the camera sees it
+    `num_traces` times, each a stretch of its own. `antenna`: "ceiling" beside the camera, or "side", at the table's edge
+    and height.
     """
-    if tracks not in ("loops", "parallel", "curves"):
-        raise ValueError(f"tracks is {tracks!r}; expected loops, parallel or curves.")
+    if tracks not in ("loops", "parallel", "curves", "ranges"):
+        raise ValueError(f"tracks is {tracks!r}; expected loops, parallel, curves or ranges.")
     if antenna not in ("ceiling", "side"):
         raise ValueError(f"antenna is {antenna!r}; expected ceiling or side.")
     stage = StageSet(make_room("ceiling_view", rng), duration_s)
     table = stage.room.tables[0]
     time_s = np.arange(stage.steps) * STEP_S
-    lines = _track_lines(tracks, num_objects, table.top_m, time_s, rng, (speed_m_s[0], speed_m_s[1]), spacing_m)
+    pace = (speed_m_s[0], speed_m_s[1])
+    if tracks == "ranges":
+        foot = np.array(stage.room.antennas_m[0]) - [0.0, 0.0, table.height_m + _TAG_UP_M]
+        lines = _range_lines(num_objects, table.top_m, foot, time_s, rng, pace, spacing_m)
+    else:
+        lines = _track_lines(tracks, num_objects, table.top_m, time_s, rng, pace, spacing_m)
     for line in lines:
         model = make_object(kind, rng)
         velocity = np.gradient(line, axis=0)
@@ -99,6 +106,27 @@ def _track_lines(kind, count, top_m, time_s, rng, speed_m_s, spacing_m) -> list[
     return lines
 
 
+def _range_lines(count, top_m, antenna_m, time_s, rng, speed_m_s, spacing_m) -> list[np.ndarray]:
+    """Paths (steps, 2) along the table from the antenna's foot; `antenna_m` is x, y and the height above the tags."""
+    if count > 2:
+        raise ValueError(f"{count} trains on tracks of different ranges; there is room for 2, one to either side.")
+    x, y, height = antenna_m
+    near, far = 0.15, 0.6
+    pace = rng.uniform(*speed_m_s)
+    swing = (far - near) / 2
+    first = near + swing + swing * np.sin(pace / swing * time_s + rng.uniform(0, 2 * np.pi))
+    longer = np.hypot(height, first) + spacing_m
+    paths = [first, np.sqrt(longer**2 - height**2)][:count]
+    sides = rng.permutation([-1.0, 1.0])
+    lines = [
+        np.stack([np.full_like(path, x), y + side * path], axis=-1) for path, side in zip(paths, sides, strict=False)
+    ]
+    if any(np.any(line[:, 1] < top_m[1] + 0.12) or np.any(line[:, 1] > top_m[3] - 0.12) for line in lines):
+        raise ValueError(f"Tracks that differ by {spacing_m} m in range leave the table; ask for less.")
+    return lines
+
+
+_TAG_UP_M = 0.15  # of a tag on a train, above the table
 _TRIES = 100
 _APART_M = 0.27  # between the middles of two things: no ball is wider
 

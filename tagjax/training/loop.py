@@ -43,7 +43,14 @@ class LoopSettings:
     progress: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("num_steps", "batch_size", "checkpoint_every", "validate_every", "log_every", "stop_after_skipped"):
+        for name in (
+            "num_steps",
+            "batch_size",
+            "checkpoint_every",
+            "validate_every",
+            "log_every",
+            "stop_after_skipped",
+        ):
             if getattr(self, name) < 1:
                 raise ValueError(f"loop.{name} is {getattr(self, name)}; expected at least 1.")
 
