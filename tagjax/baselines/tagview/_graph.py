@@ -1,0 +1,100 @@
+"""The bipartite graph of traces and tags: matching, pruning, what may not go together (Tagview, V.A-B, V.D)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ...association import hard_assignment
+
+Spread = Literal["std", "mad"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Coefficient:
+    """The linear coefficient that right pairs share (Observation V.1), and how far they spread around it."""
+
+    mean: float
+    spread: float
+
+
+def match_graph(weight: Float[np.ndarray, "traces tags"]) -> Int[np.ndarray, " traces"]:
+    """Tag of each trace in the one-to-one matching of highest total weight (Hungarian, V.A); -1 for none.
+
+    Pairs of weight 0 or less are not made: a sequence that explains nothing names nothing.
+    """
+    return hard_assignment(np.asarray(weight, np.float64), unmatched_score=0.0)
+
+
+def shared_coefficient(
+    slope: Float[np.ndarray, "traces tags"],
+    tag_of: Int[np.ndarray, " traces"],
+    *,
+    spread: Spread,
+    least_share: float,
+) -> Coefficient | None:
+    """Mean and standard deviation of the matched pairs' slopes (V.B); None where nothing is matched.
+
+    `mad` takes the median and 1.48 times the median distance from it, which single wrong matches do not move. The
+    spread is at least `least_share` of the mean: two slopes that happen to agree would cut off everything else.
+    """
+    rows = np.flatnonzero(tag_of >= 0)
+    if not len(rows):
+        return None
+    values = np.asarray(slope, np.float64)[rows, tag_of[rows]]
+    if spread == "std":
+        middle, width = float(values.mean()), float(values.std())
+    else:
+        middle = float(np.median(values))
+        width = 1.4826 * float(np.median(np.abs(values - middle)))
+    return Coefficient(middle, max(width, least_share * abs(middle), 1e-9))
+
+
+def keep_edges(
+    slope: Float[np.ndarray, "traces tags"], shared: Coefficient | None, threshold: float
+) -> Bool[np.ndarray, "traces tags"]:
+    """Edges whose z-score is at most `threshold` either way.
+
+    Eq. 8 as printed has no modulus, so that a slope far below the mean would stay, although Observation V.1 says that
+    all right pairs have the same one.
+    """
+    if shared is None:
+        return np.zeros(slope.shape, bool)
+    return np.abs(np.asarray(slope, np.float64) - shared.mean) <= threshold * shared.spread
+
+
+def cliques(
+    trace: Int[np.ndarray, " edges"],
+    tag: Int[np.ndarray, " edges"],
+    span_s: Float[np.ndarray, "traces 2"],
+    *,
+    tolerance_s: float,
+) -> list[Int[np.ndarray, " _"]]:
+    """Rows of the compatibility matrix P (V.D): sets of edges of which at most one may be selected.
+
+    One for every trace with several edges; and for every tag the largest sets of its traces that overlap in time, as a
+    thing is in one place at a time. Overlaps of `tolerance_s` or less do not count.
+    """
+    found = [np.flatnonzero(trace == number) for number in np.unique(trace)]
+    for number in np.unique(tag):
+        own = np.flatnonzero(tag == number)
+        begin, end = span_s[trace[own], 0], span_s[trace[own], 1] - tolerance_s
+        # Intervals that overlap pairwise share a moment, the latest of their beginnings.
+        together = [frozenset(own[(begin <= at) & ((end > at) | (begin == at))].tolist()) for at in begin]
+        largest = {one for one in together if not any(one < other for other in together)}
+        found += [np.array(sorted(one)) for one in sorted(largest, key=sorted)]
+    return [one for one in found if len(one) > 1]
+
+
+def edge_agreement(
+    agreement: Float[np.ndarray, "traces traces tags tags"],
+    trace: Int[np.ndarray, " edges"],
+    tag: Int[np.ndarray, " edges"],
+) -> Float[np.ndarray, "edges edges"]:
+    """Q of Eq. 10: the agreement of every two edges; 0 of an edge with itself, which says nothing."""
+    quadratic = np.asarray(agreement, np.float64)[trace[:, None], trace[None, :], tag[:, None], tag[None, :]].copy()
+    np.fill_diagonal(quadratic, 0.0)
+    return quadratic

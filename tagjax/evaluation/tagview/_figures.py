@@ -1,0 +1,66 @@
+"""Plots: boxplots of R^2 and slope (Fig. 8), accuracy by number of tags (Fig. 10), tracks over a picture (Fig. 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ...baselines.tagview import middle_px
+from ._judge import Judged, Watched
+
+PAPER_ACCURACY = {2: 0.99, 6: 0.96}
+"""Fig. 10: the ends that the text names."""
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def pair_plot(path: Path, judged: Sequence[Judged]) -> None:
+    """R^2 and slope of right and wrong pairs as boxes."""
+    figure = _figure(7.0, 3.6)
+    both = figure.subplots(1, 2)
+    for axes, kind, label in zip(both, ("r_squared", "slope"), ("R$^2$", "slope / (4$\\pi$h/$\\lambda$)"), strict=True):
+        rows = np.concatenate([getattr(one, kind) for one in judged] or [np.zeros((2, 0))], axis=1)
+        parts = [rows[0, rows[1] == 1], rows[0, rows[1] == 0]]
+        axes.boxplot([part if len(part) else [np.nan] for part in parts], widths=0.5, flierprops={"markersize": 3})
+        axes.set_xticks([1, 2], [f"correct ({len(parts[0])})", f"incorrect ({len(parts[1])})"])
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+    both[1].set_ylim(-3, 4)
+    figure.savefig(path, dpi=110)
+
+
+def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> None:
+    """Accuracy by number of tags, one line a setting, and the paper's."""
+    figure = _figure(5.5, 4.0)
+    axes: Axes = figure.subplots()
+    for name, values in accuracy.items():
+        counts = sorted(values)
+        axes.plot(counts, [values[count] for count in counts], "o-", label=name, alpha=0.8)
+    axes.plot(list(PAPER_ACCURACY), list(PAPER_ACCURACY.values()), "k+--", markersize=10, label="paper")
+    axes.set(xlabel="tags", ylabel="identification accuracy", ylim=(-0.02, 1.05))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def track_plot(path: Path, watched: Watched, picture: Shaped[np.ndarray, "height width 3"]) -> None:
+    """True middles (black +) and those of the traces (green o) over a picture, every third frame (Fig. 7)."""
+    figure = _figure(7.0, 6.0)
+    axes: Axes = figure.subplots()
+    axes.imshow(picture)
+    true, found = (middle_px(boxes[:, ::3]).reshape(-1, 2) for boxes in (watched.truth_px, watched.box_px))
+    axes.scatter(true[:, 0], true[:, 1], s=28, linewidths=0.9, marker="+", color="k")
+    axes.scatter(found[:, 0], found[:, 1], s=28, linewidths=0.9, marker="o", facecolors="none", edgecolors="lime")
+    axes.set(title=f"{watched.name}: truth +, traces o")
+    axes.set_axis_off()
+    figure.savefig(path, dpi=110)
