@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
+from tagjax.baselines.goller.run import GollerConfig
 from tagjax.config import EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
+from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.tagattention import TagAttention
 from tagjax.tracer import AbstractTracer
@@ -83,6 +86,14 @@ def test_evaluation_configurations_are_valid() -> None:
 def test_flow_evaluation_configurations_are_valid() -> None:
     settings = from_mapping(FlowEvaluationSettings, _compose("evaluate_flow"))
     assert settings.flows
+
+
+@pytest.mark.parametrize(("name", "schema"), [("goller", GollerConfig), ("tagview", TagviewExperiment)])
+def test_forerunners_configurations_are_valid(name: str, schema: type) -> None:
+    values = _compose(name)
+    fields = {field.name for field in dataclasses.fields(schema)}
+    assert from_mapping(schema, {key: value for key, value in values.items() if key in fields})
+    assert set(values) - fields <= {"command", "progress", "training"}
 
 
 def test_a_misspelt_override_is_refused() -> None:

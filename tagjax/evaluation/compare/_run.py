@@ -1,0 +1,206 @@
+"""A whole comparison: suites in (simulated where missing); a table as Markdown, CSV, JSON and a picture out."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE
+from rich.table import Table
+
+from ...config import ConfigError, from_mapping
+from ...data.store import open_recording
+from ...recording import Recording, RecordingError
+from ...sim.suites import SPLITS, Counts, Item, Suite, make_suite
+from ...tracer import Trace
+from ...viz.comparison import bar_plot
+from ..evaluate import RecordingResult, ScoreSettings, score_traces
+from ..metrics import Scores
+from ..report import write_json
+from ._systems import NAMES, Systems, SystemSettings
+from ._table import HEADS, MEASURES, Cell, bars, markdown, said, write_csv
+
+_CLAIM = 0.5
+"""Confidence from which a found tag counts as claimed."""
+
+_STILL_M = 0.05
+"""A tag that never goes further than this from where it mostly is lies still."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CompareConfig:
+    """Which systems meet on which suites. `suites` are those of `conf/benchmark`, as their files say."""
+
+    suites: Mapping[str, Mapping[str, Any]]
+    systems: SystemSettings
+    only: tuple[str, ...] = NAMES
+    out: str = "recordings/benchmark"
+    split: str = "test"
+    most: int | None = None  # recordings of each variant; all if None
+    smoke: bool = False
+    workers: int = 1
+    papers: Mapping[str, str] = dataclasses.field(default_factory=dict)  # what a suite's own paper reports
+    scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
+
+    def __post_init__(self) -> None:
+        if not self.suites:
+            raise ConfigError("No suite to compare on: benchmark=[single_static,planar_tracks], for example.")
+        if unknown := sorted(set(self.only) - set(NAMES)):
+            raise ConfigError(f"Unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)}.")
+        if self.split not in SPLITS:
+            raise ConfigError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
+        if self.most is not None and self.most < 1:
+            raise ConfigError(f"most is {self.most}; expected at least 1 recording of each variant.")
+
+
+@dataclasses.dataclass
+class _Tally:
+    """What is summed over the recordings of a cell."""
+
+    scores: Scores = dataclasses.field(default_factory=Scores)
+    error_m: list[np.ndarray] = dataclasses.field(default_factory=list)
+    still: list[np.ndarray] = dataclasses.field(default_factory=list)
+    pace_ms: list[float] = dataclasses.field(default_factory=list)
+    num: int = 0
+
+
+def run_comparison(
+    config: CompareConfig, folder: Path, *, on_progress: Callable[[str], None] | None = None
+) -> list[Cell]:
+    """Every system on every suite; writes table.md, table.csv, table.json and comparison.png after each suite."""
+    tell = on_progress or (lambda _: None)
+    folder.mkdir(parents=True, exist_ok=True)
+    systems, cells = Systems(config.systems, config.scores), list[Cell]()
+    for name, values in config.suites.items():
+        items = _items(config, from_mapping(Suite, values, where=f"benchmark {name}"), tell)
+        for system in config.only:
+            cells.append(_cell(systems, system, name, items, config, tell))
+        _write(folder, cells, config.papers)
+    return cells
+
+
+def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> list[Item]:
+    suite = suite.smoke() if config.smoke else suite
+    wanted = getattr(suite.counts, config.split)
+    wanted = wanted if config.most is None else min(wanted, config.most)
+    suite = dataclasses.replace(suite, counts=Counts(**{**dict.fromkeys(SPLITS, 0), config.split: wanted}))
+    make_suite(suite, Path(config.out), workers=config.workers, on_done=lambda made: tell(f"simulated {made.name}"))
+    items = [item for item in suite.items() if item.split == config.split]
+    if not items:
+        raise ConfigError(f"{suite.name} has no {config.split} recording; choose another split, or raise its counts.")
+    return items
+
+
+def _cell(
+    systems: Systems, system: str, suite: str, items: Iterable[Item], config: CompareConfig, tell: Callable[[str], None]
+) -> Cell:
+    tally, reason = _Tally(), None
+    for item in items:
+        tell(f"{system}: {item.name}")
+        recording = open_recording(item.path(Path(config.out)))
+        if not recording.num_frames:
+            reason = "no pictures"
+            continue
+        try:
+            _score(systems, system, item, recording, config.scores, tally)
+        except (RecordingError, ValueError) as error:
+            # Of one recording of many, a failure would change what the others' mean is of.
+            if tally.num:
+                raise
+            reason = str(error).removeprefix(f"{recording.name}: ")
+            break
+    if not tally.num:
+        return Cell(suite, system, reason=reason)
+    told = tally.scores.result()
+    flat = [np.concatenate(parts) if parts else np.zeros(0) for parts in (tally.error_m, tally.still)]
+    error_m, still = (part[np.isfinite(part)] for part in flat)
+    return Cell(
+        suite,
+        system,
+        tally.num,
+        int(told["num_frames"] or 0),
+        told.get("identification"),
+        told.get("iou"),
+        told.get("cle_px"),
+        float(np.median(error_m)) * 1e3 if len(error_m) else None,
+        told.get("found"),
+        float(np.mean(still)) if len(still) else None,
+        float(np.median(tally.pace_ms)),
+    )
+
+
+def _score(
+    systems: Systems, system: str, item: Item, recording: Recording, settings: ScoreSettings, tally: _Tally
+) -> None:
+    epcs = recording.resolve_epcs(None)
+    elapsed_s: list[float] = []
+    places: list[np.ndarray] = []
+    traces = _watched(systems.traces(system, item, recording, epcs), elapsed_s, places)
+    quiet = dataclasses.replace(settings, num_pictures=1)
+    result = score_traces(traces, recording, epcs, stride=systems.stride(system), settings=quiet)
+    tally.scores = tally.scores.merge(result.scores())
+    tally.num += 1
+    # The first piece compiles and fills caches.
+    first = min(settings.frames_at_once, len(elapsed_s) // 2)
+    tally.pace_ms.append(1e3 * float(np.mean(elapsed_s[first:])))
+    _tally_places(result, epcs, np.stack(places), tally)
+
+
+def _tally_places(result: RecordingResult, epcs: list[str], place_m: np.ndarray, tally: _Tally) -> None:
+    truth = result.recording.truth
+    for tag, epc in enumerate(epcs):
+        frames = result.frames.get(epc)
+        if frames is None:
+            continue
+        if truth is None or epc not in truth.tag_position_m:
+            continue
+        true_m = np.asarray(truth.tag_position_m[epc], np.float64)
+        if np.nanmax(np.linalg.norm(true_m - np.nanmedian(true_m, axis=0), axis=-1)) < _STILL_M:
+            tally.still.append((frames.found & (frames.confidence >= _CLAIM)).astype(np.float64))
+        gap = np.linalg.norm(place_m[:, tag] - true_m, axis=-1)
+        tally.error_m.append(gap[frames.valid & frames.found])
+
+
+def _watched(
+    traces: Iterator[tuple[int, Trace]], elapsed_s: list[float], places: list[np.ndarray]
+) -> Iterator[tuple[int, Trace]]:
+    """The same traces; notes how long each took to come, and where it puts the tags."""
+    while True:
+        begun = time.perf_counter()
+        found = next(traces, None)
+        if found is None:
+            return
+        elapsed_s.append(time.perf_counter() - begun)
+        places.append(np.asarray(found[1].centre_m, np.float64))
+        yield found
+
+
+def console_table(cells: Iterable[Cell]) -> Table:
+    """The table for a terminal; why a method does not apply stands below it."""
+    table = Table("suite", "system", *HEADS, box=SIMPLE)
+    reasons: list[str] = []
+    for cell in cells:
+        values = [said(getattr(cell, measure), measure) for measure in MEASURES]
+        if cell.reason is not None:
+            if cell.reason not in reasons:
+                reasons.append(cell.reason)
+            values = [f"({reasons.index(cell.reason) + 1})", *[""] * (len(MEASURES) - 1)]
+        table.add_row(cell.suite, cell.system, *values)
+    table.caption = (
+        "\n".join(f"({number}) does not apply: {reason}" for number, reason in enumerate(reasons, 1)) or None
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _write(folder: Path, cells: list[Cell], papers: Mapping[str, str]) -> None:
+    (folder / "table.md").write_text(markdown(cells, papers) + "\n", encoding="utf-8")
+    write_csv(folder / "table.csv", cells)
+    write_json(folder / "table.json", [dataclasses.asdict(cell) for cell in cells])
+    bar_plot(
+        folder / "comparison.png", {"identification": bars(cells, "identification"), "box IoU": bars(cells, "iou")}
+    )
