@@ -24,6 +24,7 @@ from ..flow.weights import load_weights, save_weights
 from ..recording import RecordingError
 from ..sim.flow_pairs import FlowPair
 from .checkpoint import Checkpoints
+from .devices import check_batch
 from .flow_sources import flow_dataset, installed_photographs, validation_pairs
 from .flow_step import FlowTrainState, flow_step
 from .logging import Logger
@@ -52,6 +53,7 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
     begun = time.perf_counter()
     network = make_network(config.flow)
     _check_sizes(network, config.data.variation)
+    check_batch(config.loop.batch_size)
     if config.init is not None:
         network = load_weights(network, config.init)
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)

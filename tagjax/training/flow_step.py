@@ -21,6 +21,7 @@ from ..flow.losses import (
     weighted,
 )
 from ..flow.network import AbstractFlowNetwork, flow_both_ways
+from .devices import check_batch, copied, spread
 
 
 class FlowTrainState(eqx.Module):
@@ -144,9 +145,13 @@ def flow_step(
     settings: FlowLossSettings,
     average_over: float,
 ) -> tuple[FlowTrainState, dict[str, float]]:
-    """One update on a batch of `vary`'s pairs. A loss or gradient that is not finite changes nothing but the count."""
+    """One update on a batch of `vary`'s pairs. A loss or gradient that is not finite changes nothing but the count.
+
+    All devices of the process share the batch; its size must be a multiple of theirs.
+    """
     if not samples:
         raise ValueError("A training step needs at least one pair.")
-    clean, seen = (jnp.asarray(np.stack([sample[name] for sample in samples])) for name in ("clean", "seen"))
-    state, numbers = _update((clean, seen), state, optimizer, settings, average_over)
+    check_batch(len(samples))
+    clean, seen = (spread(jnp.asarray(np.stack([sample[name] for sample in samples]))) for name in ("clean", "seen"))
+    state, numbers = _update((clean, seen), copied(state), optimizer, settings, average_over)
     return state, {name: float(value) for name, value in numbers.items()}
