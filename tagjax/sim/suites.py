@@ -218,13 +218,18 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
 
 
 def make_suite(
-    suite: Suite, folder: Path, *, workers: int = 1, on_done: Callable[[Made], None] | None = None
+    suite: Suite,
+    folder: Path,
+    *,
+    workers: int = 1,
+    on_done: Callable[[Made], None] | None = None,
+    wanted: Callable[[Item], bool] = lambda item: True,
 ) -> list[Made]:
-    """Make what is missing of a suite; finished recordings are kept, whatever happens to the rest.
+    """Make what is `wanted` and missing of a suite; finished recordings are kept, whatever happens to the rest.
 
     Each recording follows from its seed alone, so the number of workers changes nothing in it.
     """
-    todo = prepare(suite, folder)
+    todo = [item for item in prepare(suite, folder) if wanted(item)]
     made: list[Made] = []
 
     def finished(one: Made) -> None:

@@ -15,7 +15,7 @@ from rich.table import Table
 from ...config import ConfigError, from_mapping
 from ...data.store import open_recording
 from ...recording import Recording, RecordingError
-from ...sim.suites import SPLITS, Counts, Item, Suite, make_suite
+from ...sim.suites import SPLITS, Item, Suite, make_suite
 from ...tracer import Trace
 from ...viz.comparison import bar_plot
 from ..evaluate import RecordingResult, ScoreSettings, score_traces
@@ -85,11 +85,14 @@ def run_comparison(
 
 def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> list[Item]:
     suite = suite.smoke() if config.smoke else suite
-    wanted = getattr(suite.counts, config.split)
-    wanted = wanted if config.most is None else min(wanted, config.most)
-    suite = dataclasses.replace(suite, counts=Counts(**{**dict.fromkeys(SPLITS, 0), config.split: wanted}))
-    make_suite(suite, Path(config.out), workers=config.workers, on_done=lambda made: tell(f"simulated {made.name}"))
-    items = [item for item in suite.items() if item.split == config.split]
+
+    def wanted(item: Item) -> bool:
+        return item.split == config.split and (config.most is None or item.number < config.most)
+
+    folder = Path(config.out)
+    made = lambda one: tell(f"simulated {one.name}")  # noqa: E731
+    make_suite(suite, folder, workers=config.workers, on_done=made, wanted=wanted)
+    items = [item for item in suite.items() if wanted(item)]
     if not items:
         raise ConfigError(f"{suite.name} has no {config.split} recording; choose another split, or raise its counts.")
     return items
