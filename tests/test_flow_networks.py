@@ -182,6 +182,7 @@ def _loud(network: Any, where: Callable[[Any], Any], gain: float) -> Any:
     return eqx.tree_at(where, network, replace_fn=lambda weight: gain * weight)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "size", "shift"),
     [("pyramid", 128, 16), pytest.param("raft", 192, 8, marks=pytest.mark.slow)],

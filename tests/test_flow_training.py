@@ -280,6 +280,7 @@ def test_step_learns_counts_and_skips_what_is_not_finite() -> None:
         flow_step(state, [], optimizer, settings, 10.0)
 
 
+@pytest.mark.slow
 def test_a_recurrent_network_learns_by_its_sequence_beyond_the_crop() -> None:
     settings = FlowLossSettings(census_radius=1, census_stride=1, sequence_decay=0.8)
     optimizer = optax.adam(1e-3)
@@ -384,6 +385,7 @@ def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> No
     assert (tmp_path / "run" / "weights.npz").is_file()
 
 
+@pytest.mark.slow
 def test_interrupted_run_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import tagjax.training.flow_run as module
 

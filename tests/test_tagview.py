@@ -111,6 +111,7 @@ def test_interpolation_at_the_edges_of_what_is_known():
     assert whole[2] == 4.0
 
 
+@pytest.mark.slow
 def test_interpolation_has_gradients(gradients_agree):
     rng = np.random.default_rng(3)
     time, value = np.cumsum(rng.uniform(0.1, 0.3, 7)), rng.normal(size=7)

@@ -144,6 +144,7 @@ def test_offsets_lead_back_and_targets_name_every_thing():
     assert set(ignored) == {0, -1}
 
 
+@pytest.mark.slow
 def test_the_loss_counts_the_hardest_negatives_and_has_gradients():
     network = BoxNetwork((4, 6, 8), 1, key=jax.random.key(0))
     images = jax.random.uniform(jax.random.key(1), (2, 16, 16, 3))

@@ -50,16 +50,16 @@ def tabletop(
     time_s = np.arange(stage.steps) * STEP_S
     pace = (speed_m_s[0], speed_m_s[1])
     if tracks == "ranges":
-        foot = np.array(stage.room.antennas_m[0]) - [0.0, 0.0, table.height_m + _TAG_UP_M]
-        lines = _range_lines(num_objects, table.top_m, foot, time_s, rng, pace, spacing_m)
+        models = [make_object(kind, rng) for _ in range(num_objects)]
+        for model, poses in zip(models, _shunting(models, stage, time_s, rng, pace, spacing_m), strict=True):
+            stage.object(model, poses)
     else:
-        lines = _track_lines(tracks, num_objects, table.top_m, time_s, rng, pace, spacing_m)
-    for line in lines:
-        model = make_object(kind, rng)
-        velocity = np.gradient(line, axis=0)
-        yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
-        z = np.full(stage.steps, table.height_m + model.half_size_m[2])
-        stage.object(model, Poses(np.column_stack([line, z]), turn_about(UP, yaw)))
+        for line in _track_lines(tracks, num_objects, table.top_m, time_s, rng, pace, spacing_m):
+            model = make_object(kind, rng)
+            velocity = np.gradient(line, axis=0)
+            yaw = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
+            z = np.full(stage.steps, table.height_m + model.half_size_m[2])
+            stage.object(model, Poses(np.column_stack([line, z]), turn_about(UP, yaw)))
     if num_traces != 1:
         trains = [stage.bodies[tag.body] for tag in stage.tags]
         stage.bodies += tunnels(trains, table, num_traces, stage.room.camera_position_m, stage.steps, rng)
@@ -106,27 +106,35 @@ def _track_lines(kind, count, top_m, time_s, rng, speed_m_s, spacing_m) -> list[
     return lines
 
 
-def _range_lines(count, top_m, antenna_m, time_s, rng, speed_m_s, spacing_m) -> list[np.ndarray]:
-    """Paths (steps, 2) along the table from the antenna's foot; `antenna_m` is x, y and the height above the tags."""
-    if count > 2:
-        raise ValueError(f"{count} trains on tracks of different ranges; there is room for 2, one to either side.")
-    x, y, height = antenna_m
+def _shunting(models, stage, time_s, rng, speed_m_s, spacing_m) -> list[Poses]:
+    """Trains that go to and fro, without turning round, on lines to either side of below the antenna.
+
+    The distances of their tags to the antenna differ by `spacing_m` at all times.
+    """
+    if len(models) > 2:
+        raise ValueError(
+            f"{len(models)} trains on tracks of different ranges; there is room for 2, one to either side."
+        )
+    table, (x, y, antenna_up_m) = stage.room.tables[0], stage.room.antennas_m[0]
     near, far = 0.15, 0.6
-    pace = rng.uniform(*speed_m_s)
     swing = (far - near) / 2
-    first = near + swing + swing * np.sin(pace / swing * time_s + rng.uniform(0, 2 * np.pi))
-    longer = np.hypot(height, first) + spacing_m
-    paths = [first, np.sqrt(longer**2 - height**2)][:count]
-    sides = rng.permutation([-1.0, 1.0])
-    lines = [
-        np.stack([np.full_like(path, x), y + side * path], axis=-1) for path, side in zip(paths, sides, strict=False)
-    ]
-    if any(np.any(line[:, 1] < top_m[1] + 0.12) or np.any(line[:, 1] > top_m[3] - 0.12) for line in lines):
-        raise ValueError(f"Tracks that differ by {spacing_m} m in range leave the table; ask for less.")
-    return lines
+    out = near + swing + swing * np.sin(rng.uniform(*speed_m_s) / swing * time_s + rng.uniform(0, 2 * np.pi))
+    range_m, poses = None, []
+    for model, side in zip(models, rng.permutation([-1.0, 1.0]), strict=False):
+        up = table.height_m + model.half_size_m[2]
+        below = antenna_up_m - up - model.tag_m[2]
+        if range_m is not None:
+            out = np.sqrt((range_m + spacing_m) ** 2 - below**2)
+        range_m = np.hypot(below, out)
+        # Headed outward, x ahead: where the middle is when the tag is at x, y + side * out.
+        line = np.stack([x + side * model.tag_m[1] + 0 * out, y + side * (out - model.tag_m[0])], axis=-1)
+        if np.any(line[:, 1] < table.top_m[1] + 0.12) or np.any(line[:, 1] > table.top_m[3] - 0.12):
+            raise ValueError(f"Tracks that differ by {spacing_m} m in range leave the table; ask for less.")
+        turned = turn_about(UP, np.full(len(time_s), side * np.pi / 2))
+        poses.append(Poses(np.column_stack([line, np.full(len(time_s), up)]), turned))
+    return poses
 
 
-_TAG_UP_M = 0.15  # of a tag on a train, above the table
 _TRIES = 100
 _APART_M = 0.27  # between the middles of two things: no ball is wider
 
