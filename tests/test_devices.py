@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from tagjax.training.devices import check_batch, copied, spread
 
@@ -46,6 +47,7 @@ def _learn(devices: int) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_eight_devices_learn_what_one_learns():
     one, eight = _learn(1), _learn(8)
     assert (one["devices"], eight["devices"]) == (1, 8)

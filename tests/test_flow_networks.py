@@ -135,6 +135,7 @@ def test_from_scratch_the_flow_is_nearly_zero(name):
             assert np.abs(np.asarray(flow)).max() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["pyramid", *(pytest.param(name, marks=pytest.mark.slow) for name in ("flownet_c", "raft_small"))]
 )
@@ -224,6 +225,7 @@ def test_the_flownets_own_unit_does_not_leak_out(name):
         np.testing.assert_allclose(flow, np.broadcast_to([20 / stride, -40 / stride], flow.shape), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_raft_update_answers_for_its_own_correction_only():
     network = _tiny("raft_small")
     for which, answers in (((1.0, 0.0), 1), ((0.0, 1.0), 1), ((1.0, 1.0), 2)):

@@ -298,6 +298,7 @@ def test_a_recurrent_network_learns_by_its_sequence_beyond_the_crop() -> None:
         flow_step(FlowTrainState.create(small_network(), optimizer, seed=0), samples, optimizer, settings, 10.0)
 
 
+@pytest.mark.slow
 def test_average_of_the_weights_is_the_mean_at_first_and_a_running_one_later() -> None:
     settings = FlowLossSettings(census_radius=1, census_stride=1)
     optimizer = optax.sgd(0.1)
@@ -330,6 +331,7 @@ class ShiftingNetwork(AbstractFlowNetwork):
         return (jnp.zeros((height, width, 2)).at[..., 0].set(right),)
 
 
+@pytest.mark.slow
 def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     settings = FlowLossSettings(census_radius=1, census_stride=1, occlusion_after=5)
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
@@ -342,6 +344,7 @@ def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     assert shares[1] == 1.0
 
 
+@pytest.mark.slow
 def test_teacher_is_heard_late_and_then_ramped() -> None:
     settings = FlowLossSettings(
         census_radius=1, census_stride=1, self_supervision=1.0, self_supervision_after=10, self_supervision_ramp=10,

@@ -181,6 +181,7 @@ def test_refinement_is_the_weighted_least_squares_fit_where_nothing_wraps():
     )
 
 
+@pytest.mark.slow
 def test_refinement_differentiates_implicitly():
     time_s = np.linspace(0, 0.4, 30)
     phase = 4 * np.pi * 920e6 / C * 0.3 * time_s + 0.02 * np.sin(40 * time_s)
@@ -379,6 +380,7 @@ def test_window_reads_are_those_of_the_window():
     np.testing.assert_allclose(np.asarray(few.time_s[5]), [0.44, 0.46, 0.48, 0.5], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_change_nothing():
     rng = np.random.default_rng(0)
     pair = [phase_reads(simulate_reads(rng, smooth_path(rng, 1.0, 3), 3), "A", 0) for _ in range(2)]

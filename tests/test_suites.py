@@ -98,6 +98,7 @@ def _speed(path_m: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.diff(path_m, axis=0), axis=1) / STEP_S
 
 
+@pytest.mark.slow
 def test_every_train_leaves_as_many_traces_as_its_variant_says():
     """All items: stretches in which any point of the train is in the picture and in sight, among all bodies."""
     suite = _named("separated_traces")
@@ -129,6 +130,7 @@ def test_the_masks_of_a_film_come_and_go_as_often(variant):
         np.testing.assert_array_equal(shown, truth.visible[label])
 
 
+@pytest.mark.slow
 def test_everybody_comes_in_and_leaves():
     """All items: no limb, no object is in the picture at either end; each person walks about in it between."""
     suite = _named("enter_leave")

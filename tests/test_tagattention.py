@@ -67,6 +67,7 @@ def test_tags_do_not_disturb_each_other(clip, said):
     np.testing.assert_allclose(said.mask[:, 1], single.mask[:, 0], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_scan_is_the_loop_of_steps(clip):
     tracer = _learnable()
     few = jax.tree.map(lambda leaf: leaf[:5], clip.frames)
