@@ -127,6 +127,20 @@ def host_trace(
         yield frame.number, jax.tree.map(np.asarray, said)
 
 
+def joined_reads(parts: Sequence[TagReads]) -> TagReads:
+    """Reads of a row of frames in one, with the settings of the last; a column that any of them lacks is left out."""
+    if not parts:
+        return TagReads.empty()
+    last = parts[-1]
+    columns: dict[str, Any] = {}
+    for field in dataclasses.fields(last):
+        values = [getattr(part, field.name) for part in parts]
+        if isinstance(values[-1], np.ndarray):
+            whole = all(isinstance(value, np.ndarray) for value in values)
+            columns[field.name] = np.concatenate(values) if whole else None
+    return dataclasses.replace(last, **columns)
+
+
 def claims_to_trace(claims: Sequence[Claim | None], shape: tuple[int, int]) -> Trace:
     """The `Trace` of one frame from each tag's claim; None is a tag that is not found, with an empty mask.
 

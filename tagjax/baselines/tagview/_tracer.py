@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from ...recording import Intrinsics, Recording, TagReads
 from ...tracer import Trace
-from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace
+from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace, joined_reads
 from ._boxes import middle_px
 from ._detect import AbstractDetector, DetectorSettings, make_detector
 from ._match import Identification, MatchSettings, Traces, identify
@@ -128,7 +128,8 @@ class TagviewTracer(AbstractHostTracer):
         After the last frame this is the paper's result for the whole recording.
         """
         traces = self.traces(camera.intrinsics, state)
-        all_reads, time_s = _joined(state.reads)
+        all_reads = joined_reads([reads for reads, _ in state.reads])
+        time_s = np.concatenate([time_s for _, time_s in state.reads] or [np.zeros(0)])
         heard = hear(camera.epcs, all_reads, time_s, traces.time_s, reads or self.settings.reads)
         k = camera.intrinsics
         antenna_m = camera.antennas_m[self.settings.reads.antenna - 1]
@@ -209,21 +210,3 @@ def undistorted(
         lens = np.asarray(intrinsics.distortion or (0.0,) * 5, np.float64)
         out[known] = cv2.undistortPoints(points, intrinsics.matrix(), lens).reshape(-1, 2)
     return out
-
-
-def _joined(parts: tuple[tuple[TagReads, np.ndarray], ...]) -> tuple[TagReads, np.ndarray]:
-    """Reads of a row of frames in one, with the settings of the last."""
-    if not parts:
-        return TagReads.empty(), np.zeros(0)
-    last = parts[-1][0]
-    every = {
-        field.name: [getattr(reads, field.name) for reads, _ in parts]
-        for field in dataclasses.fields(TagReads)
-        if isinstance(getattr(last, field.name), np.ndarray)
-    }
-    # A column that some frames lack is left out.
-    columns = {
-        name: np.concatenate(values) if all(isinstance(value, np.ndarray) for value in values) else None
-        for name, values in every.items()
-    }
-    return dataclasses.replace(last, **columns), np.concatenate([time for _, time in parts])

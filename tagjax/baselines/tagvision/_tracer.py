@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from ...recording import Recording, TagReads
 from ...tracer import Trace
-from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace
+from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace, joined_reads
 from ._blobs import BlobSettings, backward_flow, find_blobs
 from ._match import NO_MATCH, Match, MatchSettings, match_tags
 from ._plane import PlaneCamera
@@ -94,7 +94,7 @@ class TagVision(AbstractHostTracer):
         after = VisionState(
             tracks=tracks,
             places=(*(entry for entry in state.places if entry[0] >= start_s), (frame.time_s, here)),
-            reads=_joined(state.reads[kept], frame.reads[useful]),
+            reads=joined_reads([state.reads[kept], frame.reads[useful]]),
             read_time_s=np.concatenate([state.read_time_s[kept], frame.read_time_s[useful]]),
             matches=state.matches,
             decided_s=state.decided_s,
@@ -172,18 +172,3 @@ class TagVision(AbstractHostTracer):
         if self.camera is None:
             raise ValueError("TagVision has no calibration; give one made by experiments.calibrate_camera.")
         return self.camera
-
-
-def _joined(first: TagReads, second: TagReads) -> TagReads:
-    """Reads one after the other, with the settings of the second: what a row of frames brings."""
-    columns = {
-        field.name: np.concatenate([getattr(first, field.name), getattr(second, field.name)])
-        for field in dataclasses.fields(second)
-        if isinstance(getattr(second, field.name), np.ndarray) and isinstance(getattr(first, field.name), np.ndarray)
-    }
-    blank = {
-        field.name: None
-        for field in dataclasses.fields(second)
-        if field.name not in columns and isinstance(getattr(second, field.name), np.ndarray)
-    }
-    return dataclasses.replace(second, **columns, **blank)

@@ -11,11 +11,12 @@ from ...baselines._interface import host_trace
 from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate
 from ...baselines.tagview import TagviewSettings, TagviewTracer
 from ...baselines.tagvision import TagVision, TagVisionSettings
-from ...config import ClipSettings, ConfigError, build
+from ...config import ClipSettings, ConfigError
 from ...data.store import open_recording
 from ...recording import Recording, RecordingError
 from ...sim.suites import Item
-from ...tracer import AbstractTracer, Trace
+from ...tracer import Trace
+from ...training.run import make_tracer
 from ...training.sources import clip_loader
 from ..evaluate import ScoreSettings, trace_recording
 from ..tagvision import CalibrationSettings, calibrated, table_truth
@@ -46,12 +47,7 @@ class Systems:
     def __init__(self, settings: SystemSettings, scores: ScoreSettings):
         self.settings, self.scores = settings, scores
         self._calibration: Calibration | None = None
-        self._tracers: dict[str, AbstractTracer] = {}
-        for name in NAMES[:2]:
-            tracer = build(getattr(settings, name), where=name)
-            if not isinstance(tracer, AbstractTracer):
-                raise ConfigError(f"{name} is {type(tracer).__name__}; expected a tracer.")
-            self._tracers[name] = tracer
+        self._tracers = {name: make_tracer(getattr(settings, name)) for name in NAMES[:2]}
 
     def stride(self, name: str) -> int:
         """Every how many pixels a system's masks have one."""
