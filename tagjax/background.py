@@ -23,9 +23,14 @@ def empty_background(num_tags: int, height: int, width: int) -> Background:
     return Background(jnp.zeros((height, width)), jnp.zeros((num_tags, height, width)))
 
 
+def _noise_m(distance_m: Float[Array, "height width"]) -> Float[Array, "height width"]:
+    # Three times the axial noise of structured light (Nguyen et al., 2012).
+    return 0.006 * jnp.square(distance_m)
+
+
 def _tolerance_m(distance_m: Float[Array, "height width"]) -> Float[Array, "height width"]:
-    # Three times the axial noise of structured light (Nguyen et al., 2012), and half a hand.
-    return 0.05 + 0.006 * jnp.square(distance_m)
+    # ... and half a hand.
+    return 0.05 + _noise_m(distance_m)
 
 
 def is_background(
@@ -33,6 +38,14 @@ def is_background(
 ) -> Bool[Array, "height width"]:
     """Pixels that show the surface remembered for them."""
     near = jnp.abs(distance_m - background.distance_m) <= _tolerance_m(distance_m)
+    return valid & (background.distance_m > 0) & near
+
+
+def shows_rest(
+    background: Background, distance_m: Float[Array, "height width"], valid: Bool[Array, "height width"]
+) -> Bool[Array, "height width"]:
+    """Pixels whose range is the remembered one to within the sensor's noise."""
+    near = jnp.abs(distance_m - background.distance_m) <= _noise_m(distance_m)
     return valid & (background.distance_m > 0) & near
 
 
@@ -55,8 +68,13 @@ def remember(
 def in_front(
     background: Background, distance_m: Float[Array, "height width"], valid: Bool[Array, "height width"]
 ) -> Float[Array, "height width"]:
-    """1 for pixels that show something nearer than the surface remembered, -1 for that surface, 0 if nobody knows."""
+    """1 for pixels that show something nearer than the surface remembered, -1 for that surface, 0 if nobody knows.
+
+    The mean of 3 x 3 pixels: at outlines the depth flickers between front and back.
+    """
     known = valid & (background.distance_m > 0)
     nearer = known & (distance_m < background.distance_m - _tolerance_m(distance_m))
     same = is_background(background, distance_m, valid)
-    return nearer.astype(distance_m.dtype) - same.astype(distance_m.dtype)
+    told = jnp.pad(nearer.astype(distance_m.dtype) - same.astype(distance_m.dtype), 1, mode="edge")
+    rows = told[:-2] + told[1:-1] + told[2:]
+    return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9.0

@@ -22,7 +22,7 @@ def velocity_gate(
 
 
 def log_likelihood_ratio(
-    attention: Float[Array, "*batch"], background: Float[Array, ""], floor: Float[Array, ""]
+    attention: Float[Array, "*batch"], background: Float[Array, "*#batch"], floor: Float[Array, ""]
 ) -> Float[Array, "*batch"]:
     """log((a + floor) / (a0 + floor)): evidence of an attention a for the object against the background class.
 

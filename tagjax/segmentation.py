@@ -22,33 +22,38 @@ class Segments(eqx.Module):
     cell: int = eqx.field(static=True)
 
 
-def _cell_sum(image: Float[Array, "height width channel"], cell: int) -> Float[Array, "rows columns channel"]:
+def _blocks(image: Float[Array, "height width channel"], cell: int) -> Float[Array, "channel rows cell columns cell"]:
+    """The picture as cells, filled up with zeros; channels first, where XLA vectorises best on a CPU."""
     height, width, channels = image.shape
     rows, columns = -(-height // cell), -(-width // cell)
     padded = jnp.pad(image, ((0, rows * cell - height), (0, columns * cell - width), (0, 0)))
-    return jnp.sum(padded.reshape(rows, cell, columns, cell, channels), axis=(1, 3))
+    return jnp.moveaxis(padded.reshape(rows, cell, columns, cell, channels), -1, 0)
 
 
-def _spread(
-    grid: Float[Array, "rows columns channel"], cell: int, height: int, width: int
-) -> Float[Array, "height width channel"]:
-    return jnp.repeat(jnp.repeat(grid, cell, axis=0), cell, axis=1)[:height, :width]
+def _whole(blocks: Float[Array, "channel rows cell columns cell"], height: int, width: int) -> Array:
+    """Adjoint of `_blocks`, channels first: the cells as a picture."""
+    channels, rows, cell, columns, _ = blocks.shape
+    return blocks.reshape(channels, rows * cell, columns * cell)[:, :height, :width]
 
 
-def _shifted(grid: Float[Array, "rows columns channel"], fill: float) -> list[Float[Array, "rows columns channel"]]:
-    """The grid as seen from each cell's nine neighbours, in the order of `Segments.share`."""
-    rows, columns, _ = grid.shape
-    padded = jnp.pad(grid, ((1, 1), (1, 1), (0, 0)), constant_values=fill)
-    return [padded[dy : dy + rows, dx : dx + columns] for dy in range(3) for dx in range(3)]
+def _shifted(grid: Float[Array, "channel rows columns"]) -> list[Float[Array, "channel rows columns"]]:
+    """The grid as seen from each cell's nine neighbours, in the order of `Segments.share`; zero beyond the edge."""
+    _, rows, columns = grid.shape
+    padded = jnp.pad(grid, ((0, 0), (1, 1), (1, 1)))
+    return [padded[:, dy : dy + rows, dx : dx + columns] for dy in range(3) for dx in range(3)]
 
 
-def _unshift_sum(parts: list[Float[Array, "rows columns channel"]]) -> Float[Array, "rows columns channel"]:
+def _unshift_sum(parts: Float[Array, "9 channel rows columns"]) -> Float[Array, "channel rows columns"]:
     """Adjoint of `_shifted`: hand each neighbour its part back."""
-    rows, columns, channels = parts[0].shape
-    total = jnp.zeros((rows + 2, columns + 2, channels))
-    for n, part in enumerate(parts):
-        total = total + jnp.pad(part, ((n // 3, 2 - n // 3), (n % 3, 2 - n % 3), (0, 0)))
-    return total[1:-1, 1:-1]
+    padded = [jnp.pad(part, ((0, 0), (n // 3, 2 - n // 3), (n % 3, 2 - n % 3))) for n, part in enumerate(parts)]
+    return sum(padded[1:], start=padded[0])[:, 1:-1, 1:-1]
+
+
+def _summed(
+    share: Float[Array, "9 rows cell columns cell"], values: Float[Array, "channel rows cell columns cell"]
+) -> Float[Array, "channel rows columns"]:
+    """Sum of the values of each segment's pixels, by their shares."""
+    return _unshift_sum(jnp.einsum("nrycx,frycx->nfrc", share, values))
 
 
 def segment(
@@ -66,31 +71,27 @@ def segment(
     (TagAttention, III.G, after Jaimez et al., 2017).
     """
     height, width, _ = features.shape
-    known = valid.astype(features.dtype)[..., None]
-    features = jnp.where(valid[..., None], features, 0.0)
+    known = _blocks(valid.astype(features.dtype)[..., None], cell)
+    pixels = jnp.concatenate([_blocks(jnp.where(valid[..., None], features, 0.0), cell), known])
 
-    def centres(shares: Float[Array, "9 height width"]) -> Float[Array, "rows columns channel"]:
-        stacked = jnp.concatenate([features, known], axis=-1)
-        summed = _unshift_sum([_cell_sum(stacked * share[..., None], cell) for share in shares])
-        mass = summed[..., -1:]
-        return jnp.concatenate([summed[..., :-1] / jnp.maximum(mass, 1e-6), mass], axis=-1)
+    def centres(summed: Float[Array, "channel rows columns"]) -> Float[Array, "channel rows columns"]:
+        return jnp.concatenate([summed[:-1] / jnp.maximum(summed[-1:], 1e-6), summed[-1:]])
 
-    own = jnp.zeros((9, height, width)).at[4].set(known[..., 0])
-    seeds = centres(own)
-
-    def assign(seeds: Float[Array, "rows columns channel"]) -> Float[Array, "9 height width"]:
+    def assign(seeds: Float[Array, "channel rows columns"]) -> Float[Array, "9 rows cell columns cell"]:
         scores = []
-        for near in _shifted(seeds, 0.0):
-            spread = _spread(near, cell, height, width)
-            squared = jnp.sum(jnp.square(features - spread[..., :-1]), axis=-1)
-            scores.append(jnp.where(spread[..., -1] > 0.5, -squared / (2.0 * temperature**2), -_FAR))
-        return jax.nn.softmax(jnp.stack(scores), axis=0) * known[None, ..., 0]
+        for near in _shifted(seeds):
+            apart = [
+                jnp.square(one - centre[:, None, :, None]) for one, centre in zip(pixels[:-1], near[:-1], strict=True)
+            ]
+            squared = sum(apart[1:], start=apart[0])
+            scores.append(jnp.where(near[-1][:, None, :, None] > 0.5, -squared / (2.0 * temperature**2), -_FAR))
+        return jax.nn.softmax(jnp.stack(scores), axis=0) * known
 
-    def iterate(seeds: Float[Array, "rows columns channel"], _: None):
-        return centres(assign(seeds)), None
+    def iterate(seeds: Float[Array, "channel rows columns"], _: None):
+        return centres(_summed(assign(seeds), pixels)), None
 
-    seeds, _ = jax.lax.scan(iterate, seeds, None, length=num_iterations)
-    return Segments(share=assign(seeds), weight=seeds[..., -1], cell=cell)
+    seeds, _ = jax.lax.scan(iterate, centres(jnp.sum(pixels, axis=(2, 4))), None, length=num_iterations)
+    return Segments(share=_whole(assign(seeds), height, width), weight=seeds[-1], cell=cell)
 
 
 def pool(
@@ -98,7 +99,8 @@ def pool(
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     """Weighted mean of pixel values over each segment, and the weight that stands behind it (0 where none)."""
     stacked = jnp.concatenate([values * weight[..., None], weight[..., None]], axis=-1)
-    summed = _unshift_sum([_cell_sum(stacked * share[..., None], segments.cell) for share in segments.share])
+    share = _blocks(jnp.moveaxis(segments.share, 0, -1), segments.cell)
+    summed = jnp.moveaxis(_summed(share, _blocks(stacked, segments.cell)), 0, -1)
     mass = summed[..., -1]
     mean = summed[..., :-1] / jnp.where(mass > 1e-6, mass, 1.0)[..., None]
     return jnp.where(mass[..., None] > 1e-6, mean, 0.0), mass
@@ -107,11 +109,10 @@ def pool(
 def unpool(segments: Segments, grid: Float[Array, "rows columns channel"]) -> Float[Array, "height width channel"]:
     """Segment values handed back to the pixels by their shares."""
     _, height, width = segments.share.shape
-    spread = [
-        _spread(near, segments.cell, height, width) * share[..., None]
-        for near, share in zip(_shifted(grid, 0.0), segments.share, strict=True)
-    ]
-    return sum(spread, start=jnp.zeros((height, width, grid.shape[-1])))
+    share = _blocks(jnp.moveaxis(segments.share, 0, -1), segments.cell)
+    near = jnp.stack(_shifted(jnp.moveaxis(grid, -1, 0)))
+    spread = jnp.einsum("nrycx,nfrc->frycx", share, near)
+    return jnp.moveaxis(_whole(spread, height, width), 0, -1)
 
 
 def diffuse(
@@ -128,7 +129,7 @@ def diffuse(
     """
 
     def spread(x: Float[Array, "rows columns"], _: None):
-        near = jnp.stack([part[..., 0] for part in _shifted(x[..., None], 0.0)])
+        near = jnp.concatenate(_shifted(x[None]))
         return (1.0 - rate) * values + rate * jnp.sum(near * affinity, axis=0), None
 
     out, _ = jax.lax.scan(spread, values, None, length=num_iterations)
@@ -144,9 +145,8 @@ def segment_affinity(
 ) -> Float[Array, "9 rows columns"]:
     """How much each segment and its eight neighbours are one thing: near in 3D and moving alike; sums to 1."""
     alive = segments.weight > 1.0
-    near = jnp.stack(
-        _shifted(jnp.concatenate([centre_m, step_m[..., None], alive.astype(step_m.dtype)[..., None]], axis=-1), 0.0)
-    )
+    told = jnp.concatenate([centre_m, step_m[..., None], alive.astype(step_m.dtype)[..., None]], axis=-1)
+    near = jnp.moveaxis(jnp.stack(_shifted(jnp.moveaxis(told, -1, 0))), 1, -1)
     apart = jnp.sum(jnp.square(near[..., :3] - centre_m[None]), axis=-1) / (2.0 * length_m**2)
     unlike = jnp.square(near[..., 3] - step_m[None]) / (2.0 * step_scale_m**2)
     raw = jnp.where((near[..., 4] > 0.5) & alive[None], jnp.exp(-apart - unlike), 0.0)
@@ -243,17 +243,19 @@ def compact_cut(
     log_odds: Float[Array, "height width"],
     *,
     level: Float[Array, ""],
+    share: Float[Array, ""],
     margin: Float[Array, ""],
     width: Float[Array, ""],
     extent_m: Float[Array, ""],
 ) -> tuple[Float[Array, "height width"], Float[Array, " 3"]]:
     """A soft mask that is one compact thing in 3D, and its centre.
 
-    The mask is sigmoid((l - threshold - |p - c|^2 / (2 extent^2)) / width) with threshold = min(level, best - margin),
+    The mask is sigmoid((l - threshold - |p - c|^2 / (2 extent^2)) / width) with threshold = min(level + share
+    max(best - level, 0), best - margin),
     where c is the mode (mean shift) of the points whose l passes, started at the best of them.
     """
     best = jnp.max(jnp.where(valid, log_odds, -1e3))
-    threshold = jnp.minimum(level, best - margin)
+    threshold = jnp.minimum(level + share * jax.nn.relu(best - level), best - margin)
     known = valid.astype(log_odds.dtype)
     weight = jax.nn.sigmoid((log_odds - threshold) / width) * known
     peak = jnp.where(valid, jnp.exp(jnp.minimum(log_odds - best, 0.0) / width), 0.0)

@@ -11,6 +11,7 @@ the settings at which all of it is gone and the likelihood and the cut are the p
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -18,10 +19,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._numerics import logit, safe_norm
+from ._numerics import logit, safe_norm, safe_sqrt
 from .anchor import Anchor, log_density, lost_drift_m, move_anchor, update_belief, votes
 from .attention import att_corr, att_rbf, attention, centre_first, coherent_score, read_support
-from .background import Background, empty_background, in_front, is_background, remember
+from .background import Background, empty_background, in_front, is_background, remember, shows_rest
 from .motion import MotionMap, carry, empty_motion, push_gather
 from .propagation import log_likelihood_ratio, propagate, radio_speed, soft_clip, velocity_gate
 from .rf.reads import PhaseReads, RadioWindow
@@ -32,12 +33,17 @@ SIGNIFICANCE = 1e-3
 """Share of the pixels by which the histogram rises at a corner of its CDF."""
 
 
+MIN_RADIUS_M = 0.05
+"""No object is taken to be smaller than this."""
+
+
 class Place(eqx.Module):
     """Where each tag's object was at the last frame."""
 
     centre_m: Float[Array, "*tag 3"]
     velocity_m_s: Float[Array, "*tag 3"]
     confidence: Float[Array, "*tag"]
+    radius_m: Float[Array, "*tag"]  # root mean square distance of its points from the centre
 
 
 class TagAttentionState(eqx.Module):
@@ -56,6 +62,7 @@ class _View(eqx.Module):
 
     points_m: Float[Array, "height width 3"]
     distance_m: Float[Array, "height width"]
+    elapsed_s: Float[Array, ""]
     valid: Bool[Array, "height width"]
     front: Float[Array, "height width"]
     time_s: Float[Array, " window"]
@@ -90,10 +97,13 @@ def paper_limit() -> dict[str, Any]:
         "floor": 1e-6,
         "background": 1.0,
         "profile": 0.0,
+        "slack": nothing,
+        "noise_share": nothing,
+        "rest": 0.0,
         "coherent_weight": nothing,
         "v0_m_s": 0.1,
         "gate_width_m_s": 1e-6,
-        "forgetting": 1.0,
+        "memory_s": 1e9,
         "evidence_limit": 1e6,
         "pool_motion": 0.0,
         "pool_log_odds": 0.0,
@@ -118,25 +128,31 @@ class TagAttention(AbstractTracer):
     log_floor: Float[Array, ""]
     logit_background: Float[Array, ""]
     logit_profile: Float[Array, ""]
+    log_slack: Float[Array, ""]
+    log_noise_share: Float[Array, ""]
+    logit_rest: Float[Array, ""]
     log_coherent_weight: Float[Array, ""]
     coherent_level: Float[Array, ""]
     log_v0: Float[Array, ""]
     log_gate_width: Float[Array, ""]
-    logit_forgetting: Float[Array, ""]
+    log_memory: Float[Array, ""]
     log_evidence_limit: Float[Array, ""]
     logit_pool_motion: Float[Array, ""]
     logit_pool_log_odds: Float[Array, ""]
     log_segment_temperature: Float[Array, ""]
     logit_diffusion: Float[Array, ""]
     log_affinity_length: Float[Array, ""]
-    log_affinity_step: Float[Array, ""]
+    log_affinity_speed: Float[Array, ""]
     cut: Float[Array, ""]
     log_cut_width: Float[Array, ""]
     log_cut_margin: Float[Array, ""]
+    logit_cut_share: Float[Array, ""]
     log_extent: Float[Array, ""]
     log_prior_weight: Float[Array, ""]
-    log_prior_radius: Float[Array, ""]
+    log_prior_reach: Float[Array, ""]
     logit_inertia: Float[Array, ""]
+    logit_size_rate: Float[Array, ""]
+    logit_range_share: Float[Array, ""]
     log_anchor_weight: Float[Array, ""]
     log_anchor_width: Float[Array, ""]
     log_anchor_depth: Float[Array, ""]
@@ -161,25 +177,31 @@ class TagAttention(AbstractTracer):
         floor: float = 0.02,
         background: float = 0.3,
         profile: float = 1.0,
+        slack: float = 0.05,
+        noise_share: float = 0.1,
+        rest: float = 0.3,
         coherent_weight: float = 2.0,
         coherent_level: float = 0.6,
         v0_m_s: float = 0.2,
         gate_width_m_s: float = 0.05,
-        forgetting: float = 0.97,
+        memory_s: float = 3.3,
         evidence_limit: float = 12.0,
         pool_motion: float = 0.9,
         pool_log_odds: float = 0.8,
-        segment_temperature_m: float = 0.06,
+        segment_temperature: float = 0.2,
         diffusion: float = 0.5,
-        affinity_length_m: float = 0.3,
-        affinity_step_m: float = 0.08,
+        affinity_length: float = 1.0,
+        affinity_speed_m_s: float = 0.8,
         cut: float = 1.0,
         cut_width: float = 0.5,
         cut_margin: float = 2.0,
+        cut_share: float = 0.02,
         extent_m: float = 0.8,
         prior_weight: float = 8.0,
-        prior_radius_m: float = 0.5,
+        prior_reach: float = 0.625,
         inertia: float = 0.9,
+        size_rate: float = 0.001,
+        range_share: float = 0.97,
         anchor_weight: float = 0.2,
         anchor_width_m: float = 0.2,
         anchor_depth_m: float = 0.2,
@@ -188,7 +210,7 @@ class TagAttention(AbstractTracer):
         anchor_rate: float = 0.3,
         anchor_unseen: float = -1.0,
         foreground_weight: float = 3.0,
-        cell: int = 8,
+        cell: int = 6,
         max_speed_m_s: float = 3.0,
         box_tail: float = 0.02,
         doubled_angle: bool = True,
@@ -202,16 +224,24 @@ class TagAttention(AbstractTracer):
             beta: share of the RBF attention (Eq. 6).
             floor, background: floor and background attention of the log-likelihood ratio.
             profile: share of the mean misfit over a window that is taken for noise of its first sample; 0 in the paper.
+            slack: misfit allowed as a share of the tag's own motion: what swings or turns moves a little unlike it.
+            noise_share: share of the radio's variance that widens the kernel.
+            rest: how much a pixel at rest counts as explained by the background; 0 in the paper.
             coherent_weight, coherent_level: weight of the coherent phase term, and the score that speaks for neither.
             v0_m_s, gate_width_m_s: velocity threshold (Eq. 7) and width of its soft step.
-            forgetting: factor on the past per frame of full evidence; 1 in the paper.
+            memory_s: time in which evidence fades to 1/e while more comes in; infinite in the paper.
             evidence_limit: bound of the log odds.
             pool_motion, pool_log_odds: share of the 3D segment's mean in a pixel's motion and log odds.
-            segment_temperature_m: softness of K-means, metres.
-            diffusion, affinity_length_m, affinity_step_m: how much, how far and how alike segments share log odds.
-            cut, cut_width, cut_margin: log odds of the mask's edge; its softness; at most `cut_margin` below the best.
+            segment_temperature: softness of K-means, cells.
+            diffusion, affinity_length, affinity_speed_m_s: how much, how far (cells) and how alike segments share
+                log odds.
+            cut, cut_width, cut_margin, cut_share: log odds of the mask's edge; its softness; at least `cut_margin` below
+                the best; and so far from `cut` towards the best (the paper's cut is relative to the best alone).
             extent_m: how far an object reaches from its centre.
-            prior_weight, prior_radius_m, inertia: pull towards the place predicted from the last frame.
+            prior_weight, prior_reach, inertia: pull towards the place predicted from the last frame, within so many
+                radii of the object as it was then.
+            size_rate: how fast that radius follows the mask's; at 0 it stays `extent_m`.
+            range_share: share of the anchor in the confidence.
             anchor_weight, anchor_width_m, anchor_unseen: how much a frame's evidence tells about the tag's range; how
                 near a segment must be to vote; log likelihood of a range at which nothing agrees (it may be hidden).
             anchor_depth_m, anchor_limit, anchor_rate: depth of an object; bound of the log density of its range; the
@@ -229,20 +259,23 @@ class TagAttention(AbstractTracer):
             raise ValueError(f"cut_rule is {cut_rule!r}; expected 'margin' or 'cdf_corner'.")
         self.log_alpha, self.logit_beta = _log(alpha_m2), _logit(beta)
         self.log_floor, self.logit_background = _log(floor), _logit(background)
-        self.logit_profile = _logit(profile)
+        self.logit_profile, self.log_slack = _logit(profile), _log(slack)
+        self.log_noise_share, self.logit_rest = _log(noise_share), _logit(rest)
         self.log_coherent_weight = _log(coherent_weight)
         self.coherent_level = jnp.asarray(coherent_level, jnp.float32)
         self.log_v0, self.log_gate_width = _log(v0_m_s), _log(gate_width_m_s)
-        self.logit_forgetting, self.log_evidence_limit = _logit(forgetting), _log(evidence_limit)
+        self.log_memory, self.log_evidence_limit = _log(memory_s), _log(evidence_limit)
         self.logit_pool_motion, self.logit_pool_log_odds = _logit(pool_motion), _logit(pool_log_odds)
-        self.log_segment_temperature = _log(segment_temperature_m)
+        self.log_segment_temperature = _log(segment_temperature)
         self.logit_diffusion = _logit(diffusion)
-        self.log_affinity_length, self.log_affinity_step = _log(affinity_length_m), _log(affinity_step_m)
+        self.log_affinity_length, self.log_affinity_speed = _log(affinity_length), _log(affinity_speed_m_s)
         self.cut = jnp.asarray(cut, jnp.float32)
         self.log_cut_width, self.log_cut_margin = _log(cut_width), _log(cut_margin)
+        self.logit_cut_share = _logit(cut_share)
         self.log_extent = _log(extent_m)
-        self.log_prior_weight, self.log_prior_radius = _log(prior_weight), _log(prior_radius_m)
-        self.logit_inertia = _logit(inertia)
+        self.log_prior_weight, self.log_prior_reach = _log(prior_weight), _log(prior_reach)
+        self.logit_inertia, self.logit_size_rate = _logit(inertia), _logit(size_rate)
+        self.logit_range_share = _logit(range_share)
         self.log_anchor_weight, self.log_anchor_width = _log(anchor_weight), _log(anchor_width_m)
         self.log_anchor_depth, self.log_anchor_limit = _log(anchor_depth_m), _log(anchor_limit)
         self.log_anchor_drift, self.log_anchor_rate = _log(anchor_drift_m), _log(anchor_rate)
@@ -272,7 +305,12 @@ class TagAttention(AbstractTracer):
             motion=empty_motion(height, width, num_window),
             time_s=jnp.broadcast_to(frame.time_s, (num_window,)),
             log_odds=jnp.zeros((num_tags, height, width)),
-            place=Place(jnp.zeros((num_tags, 3)), jnp.zeros((num_tags, 3)), jnp.zeros(num_tags)),
+            place=Place(
+                jnp.zeros((num_tags, 3)),
+                jnp.zeros((num_tags, 3)),
+                jnp.zeros(num_tags),
+                jnp.broadcast_to(jnp.exp(self.log_extent), (num_tags,)),
+            ),
             anchor=Anchor.unknown(num_tags, num_window, self.anchor_bins),
             background=empty_background(num_tags, height, width),
         )
@@ -283,19 +321,22 @@ class TagAttention(AbstractTracer):
         distance = jnp.where(valid, safe_norm(points - camera.antenna_m[None, None]), 0.0)
         time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
         elapsed_s = jnp.maximum(time_s[-1] - time_s[-2], 1e-3)
-        motion = push_gather(state.motion, frame.backward_px, distance, self.max_speed_m_s * elapsed_s + 0.05)
+        # What shows the surface that has always been there has not moved, whatever shadow runs over it.
+        rests = shows_rest(state.background, distance, valid)
+        backward_px = jnp.where(rests[..., None], 0.0, frame.backward_px)
+        motion = push_gather(state.motion, backward_px, distance, self.max_speed_m_s * elapsed_s + 0.05)
         recent = motion.valid[..., -1] & motion.valid[..., -2]
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
-        view = self._view(points, distance, valid, motion, step_m, time_s, state.background)
+        view = self._view(camera, points, distance, valid, motion, step_m, time_s, elapsed_s, state.background)
 
-        moved = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), frame.backward_px, jnp.zeros(())), -1, 0)
+        moved = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), backward_px, jnp.zeros(())), -1, 0)
         # A surface that was hidden a frame ago brings no history of its own, but for what its pixel remembers.
         shows = is_background(state.background, distance, valid)
         recalled = jnp.where(shows[None], state.background.log_odds, 0.0)
         carried = jnp.where((motion.valid[..., -2] | ~valid)[None], moved, recalled)
 
-        log_odds, mask, place, anchor = jax.vmap(self._trace_tag, in_axes=(None, None, 0, 0, 0, 0, 0))(
-            view, elapsed_s, carried, frame.radio, frame.reads, state.place, state.anchor
+        log_odds, mask, place, anchor = jax.vmap(self._trace_tag, in_axes=(None, 0, 0, 0, 0, 0))(
+            view, carried, frame.radio, frame.reads, state.place, state.anchor
         )
         background = remember(state.background, distance, valid, log_odds)
         out = describe(mask, place.centre_m, step_m, recent, place.confidence, self.box_tail)
@@ -307,27 +348,30 @@ class TagAttention(AbstractTracer):
 
     def _view(
         self,
+        camera: Camera,
         points_m: Float[Array, "height width 3"],
         distance_m: Float[Array, "height width"],
         valid: Bool[Array, "height width"],
         motion: MotionMap,
         step_m: Float[Array, "height width"],
         time_s: Float[Array, " window"],
+        elapsed_s: Float[Array, ""],
         background: Background,
     ) -> _View:
         """Segments, their motion, and what stands in front: once a frame, for all tags."""
-        features = jnp.concatenate([points_m, step_m[..., None]], axis=-1)
+        features = self._features(camera, points_m, valid, step_m, elapsed_s)
         segments = segment(features, valid, jnp.exp(self.log_segment_temperature), cell=self.cell)
         rho, known, rho_segment = self._pooled_motion(segments, motion)
         means, mass = pool(
             segments, jnp.concatenate([features, distance_m[..., None]], axis=-1), valid.astype(points_m.dtype)
         )
         affinity = segment_affinity(
-            segments, means[..., :3], means[..., 3], jnp.exp(self.log_affinity_length), jnp.exp(self.log_affinity_step)
+            segments, means[..., :3], means[..., 3], jnp.exp(self.log_affinity_length), jnp.ones(())
         )
         return _View(
             points_m=points_m,
             distance_m=distance_m,
+            elapsed_s=elapsed_s,
             valid=valid,
             front=in_front(background, distance_m, valid),
             time_s=time_s,
@@ -340,10 +384,28 @@ class TagAttention(AbstractTracer):
             rho_segment=rho_segment,
         )
 
+    def _features(
+        self,
+        camera: Camera,
+        points_m: Float[Array, "height width 3"],
+        valid: Bool[Array, "height width"],
+        step_m: Float[Array, "height width"],
+        elapsed_s: Float[Array, ""],
+    ) -> Float[Array, "height width 4"]:
+        """Position in cells, (x, y) / cell and (f / cell) log z, and step in units of `affinity_speed_m_s`.
+
+        Differences of position are metric ones over the width of a cell at that depth: segments of a thing in the
+        hand and of a walker far away are made alike.
+        """
+        focal_px = 1.0 / (camera.rays[0, 1, 0] - camera.rays[0, 0, 0])
+        depth_m = jnp.where(valid, points_m[..., 2], 1.0)
+        place = jnp.stack([camera.rays[..., 0], camera.rays[..., 1], jnp.log(depth_m)], axis=-1) * focal_px / self.cell
+        step = step_m / (jnp.exp(self.log_affinity_speed) * elapsed_s)
+        return jnp.concatenate([place, step[..., None]], axis=-1)
+
     def _trace_tag(
         self,
         view: _View,
-        elapsed_s: Float[Array, ""],
         carried: Float[Array, "height width"],
         radio: RadioWindow,
         reads: PhaseReads,
@@ -359,7 +421,7 @@ class TagAttention(AbstractTracer):
             anchor, view.distance_m, jnp.exp(self.log_anchor_depth), jnp.exp(self.log_anchor_limit)
         ) * valid.astype(evidence.dtype)
         evidence = evidence + jnp.exp(self.log_anchor_rate) * near
-        log_odds = propagate(carried, evidence, gate, jax.nn.sigmoid(self.logit_forgetting))
+        log_odds = propagate(carried, evidence, gate, jnp.exp(-view.elapsed_s / jnp.exp(self.log_memory)))
         log_odds = soft_clip(log_odds, jnp.exp(self.log_evidence_limit))
 
         share = jax.nn.sigmoid(self.logit_pool_log_odds)
@@ -373,14 +435,19 @@ class TagAttention(AbstractTracer):
         spread = diffuse(pooled[..., 0], view.affinity, jax.nn.sigmoid(self.logit_diffusion))
         # What carries the tag moves, so it stands before what has always been there.
         shown = refine(spread) + near + jnp.exp(self.log_foreground_weight) * view.front
-        predicted = place.centre_m + place.velocity_m_s * elapsed_s * jax.nn.sigmoid(self.logit_inertia)
-        mask, centre = self._cut(view, shown, predicted, place.confidence)
-        sure = jnp.max(jnp.where((mask > 0.5) & valid, refined + near, -9.0))
+        predicted = place.centre_m + place.velocity_m_s * view.elapsed_s * jax.nn.sigmoid(self.logit_inertia)
+        mask, centre = self._cut(view, shown, predicted, place)
+        told = refined + jax.nn.sigmoid(self.logit_range_share) * near
+        sure = jnp.max(jnp.where((mask > 0.5) & valid, told, -9.0))
         confidence = jax.nn.sigmoid(sure)
         both = (place.confidence > 0.5) & (confidence > 0.5)
-        move = jnp.clip((centre - place.centre_m) / elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
+        move = jnp.clip((centre - place.centre_m) / view.elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
         velocity = jnp.where(both, 0.5 * place.velocity_m_s + 0.5 * move, 0.0)
-        return refined, mask, Place(centre, velocity, confidence), anchor
+        away = jnp.sum(jnp.square(view.points_m - centre[None, None]), axis=-1)
+        radius = safe_sqrt(jnp.sum(mask * away) / jnp.maximum(jnp.sum(mask), 1e-6))
+        rate = jax.nn.sigmoid(self.logit_size_rate)
+        held = jnp.where(confidence > 0.5, (1.0 - rate) * place.radius_m + rate * radius, place.radius_m)
+        return refined, mask, Place(centre, velocity, confidence, held), anchor
 
     def _pooled_motion(
         self, segments: Segments, motion: MotionMap
@@ -411,14 +478,32 @@ class TagAttention(AbstractTracer):
         """Log-likelihood ratio of object against background at each pixel: Eqs. 4-6 and the coherent phase term."""
         everywhere = jnp.ones(view.rho.shape, dtype=bool)
         relative = radio.relative_m[None, None]
+        profile = jax.nn.sigmoid(self.logit_profile)
+        known_m = jnp.where(jnp.isfinite(radio.std_m), radio.std_m, 0.0)
+        travelled_m2 = jnp.sum(jnp.square(radio.relative_m - profile * jnp.mean(radio.relative_m)))
+        alpha = (
+            jnp.exp(self.log_alpha)
+            + jnp.exp(self.log_noise_share) * jnp.sum(jnp.square(known_m))
+            + jnp.exp(2.0 * self.log_slack) * travelled_m2
+        )
         # The mean misfit over the window is profiled out: a single noisy first sample would offset all others.
-        offset = jax.nn.sigmoid(self.logit_profile) * jnp.mean(view.rho - relative, axis=-1, keepdims=True)
-        rbf = att_rbf(view.rho - offset, relative, everywhere, jnp.exp(self.log_alpha)[None, None])
+        offset = profile * jnp.mean(view.rho - relative, axis=-1, keepdims=True)
+        rbf = att_rbf(view.rho - offset, relative, everywhere, alpha[None, None])
         corr = att_corr(view.rho, relative, everywhere)
         att = attention(rbf, corr, jax.nn.sigmoid(self.logit_beta))
-        ratio = log_likelihood_ratio(att, jax.nn.sigmoid(self.logit_background), jnp.exp(self.log_floor))
-        score = coherent_score(view.rho_segment, reads, view.time_s, doubled_angle=self.doubled_angle)
-        coherent = unpool(view.segments, (score - self.coherent_level)[..., None] * read_support(reads))[..., 0]
+        # What does not move at all needs no tag to explain it: at rest a pixel is background as far as it can be told.
+        still = view.rho - profile * jnp.mean(view.rho, axis=-1, keepdims=True)
+        at_rest = att_rbf(still, jnp.zeros_like(relative), everywhere, alpha[None, None])
+        level = jax.nn.sigmoid(self.logit_background)
+        background = level + (1.0 - level) * jax.nn.sigmoid(self.logit_rest) * at_rest
+        ratio = log_likelihood_ratio(att, background, jnp.exp(self.log_floor))
+        coherent_of = functools.partial(
+            coherent_score, reads=reads, time_s=view.time_s, doubled_angle=self.doubled_angle
+        )
+        score, score_at_rest = coherent_of(view.rho_segment), coherent_of(jnp.zeros((1, 1, view.rho.shape[-1])))
+        excess = jax.nn.relu(score_at_rest - self.coherent_level)
+        beyond = score - self.coherent_level - jax.nn.sigmoid(self.logit_rest) * excess
+        coherent = unpool(view.segments, beyond[..., None] * read_support(reads))[..., 0]
         return jnp.where(view.known, ratio + jnp.exp(self.log_coherent_weight) * coherent, 0.0)
 
     def _update_anchor(
@@ -449,7 +534,7 @@ class TagAttention(AbstractTracer):
         view: _View,
         log_odds: Float[Array, "height width"],
         predicted_m: Float[Array, " 3"],
-        confidence: Float[Array, ""],
+        place: Place,
     ) -> tuple[Float[Array, "height width"], Float[Array, " 3"]]:
         """The soft mask, and the object's centre: log odds with the place prior, cut, kept to one compact thing."""
         width = jnp.exp(self.log_cut_width)
@@ -458,13 +543,15 @@ class TagAttention(AbstractTracer):
             total = jnp.maximum(jnp.sum(mask), 1e-6)
             return mask, jnp.sum(view.points_m * mask[..., None], axis=(0, 1)) / total
         away = jnp.sum(jnp.square(view.points_m - predicted_m[None, None]), axis=-1)
-        near = jnp.exp(-away / (2.0 * jnp.exp(2.0 * self.log_prior_radius)))
-        prior = jnp.exp(self.log_prior_weight) * confidence * (2.0 * near - 1.0)
+        reach = jnp.exp(self.log_prior_reach) * jnp.maximum(place.radius_m, MIN_RADIUS_M)
+        near = jnp.exp(-away / (2.0 * jnp.square(reach)))
+        prior = jnp.exp(self.log_prior_weight) * jax.nn.relu(2.0 * place.confidence - 1.0) * (2.0 * near - 1.0)
         return compact_cut(
             view.points_m,
             view.valid,
             log_odds + prior,
             level=self.cut,
+            share=jax.nn.sigmoid(self.logit_cut_share),
             margin=jnp.exp(self.log_cut_margin),
             width=width,
             extent_m=jnp.exp(self.log_extent),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import shutil
 import time
@@ -17,11 +18,12 @@ from zarr.storage import LocalStore
 
 from ..flow.named import flow_along, flow_key, make_flow
 from ..flow.opencv import FlowFunction
+from ..flow.stillness import settled
 from ..recording import Recording, RecordingError
 from .store import StoredFrames, create_array
 
 _FOLDER = "cache/flow"
-_VERSION = 1
+_VERSION = 3
 """To be raised when the same name gives another flow: older caches are then computed again."""
 
 _ABANDONED_S = 3600.0
@@ -33,10 +35,11 @@ _WAYS = ("forward", "backward")
 def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Flow between frames t - 1 and t for t = first .. last - 1: (forward on t - 1, backward on t).
 
-    Both float32 (frames, height, width, 2), pixels of the full picture; zero where there is no frame before. `method`
-    is a flow that `make_flow` knows. The flow of the whole recording is computed on the first call and kept in half
-    precision in its folder, under `cache/flow/<key>/` (`flow_key`: other weights of a network have another), where that
-    can be written; otherwise only the frames asked for are computed.
+    Both float32 (frames, height, width, 2), pixels of the full picture; zero where there is no frame before, and where
+    rest explains the pictures as well (`settled`). `method` is a flow that `make_flow` knows. The flow of the whole
+    recording is computed on the first call and kept in half precision in its folder, under `cache/flow/<key>/`
+    (`flow_key`: other weights of a network have another), where that can be written; otherwise only the frames asked
+    for are computed.
     """
     if first < 0 or last > recording.num_frames or first >= last:
         raise ValueError(f"Frames {first} to {last} asked for; {recording.name} has {recording.num_frames}.")
@@ -101,7 +104,10 @@ def _pairs(recording: Recording, first: int, last: int, flow: FlowFunction):
     if first == 0:
         zero = np.zeros((*recording.colour.shape[1:3], 2), np.float32)
         yield zero, zero
-    yield from flow_along(flow, (np.asarray(recording.colour[t]) for t in range(start, last)))
+    pictures, again = itertools.tee(np.asarray(recording.colour[t]) for t in range(start, last))
+    along = zip(itertools.pairwise(again), flow_along(flow, pictures), strict=True)
+    for (before, after), (forward, backward) in along:
+        yield settled(forward, before, after), settled(backward, after, before)
 
 
 def _fill(recording: Recording, folder: Path, key: str, flow: FlowFunction) -> None:

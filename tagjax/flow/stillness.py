@@ -1,0 +1,42 @@
+"""What rest explains as well has not moved: flow that only follows the noise is set to zero.
+
+Where a picture shows little texture a flow follows the sensor's noise, by pixels. Depth turns that into centimetres of
+motion on every slanted floor, which is as much as a tag in a hand moves between two frames.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from .pictures import check_pictures
+
+BLOCK_PX = 7
+"""Side of the square over which residuals are averaged."""
+
+GAIN = 2.5
+"""A flow that does not divide the mean squared residual of rest by this much explains noise."""
+
+_LEAST_VARIANCE = 0.25  # of eight-bit brightness: rounding alone has 1/6 in a difference
+
+
+def settled(
+    flow_px: Float[np.ndarray, "height width 2"],
+    here: UInt8[np.ndarray, "height width 3"],
+    there: UInt8[np.ndarray, "height width 3"],
+) -> Float[np.ndarray, "height width 2"]:
+    """The flow from `here` to `there`, zero where rest explains the pictures as well.
+
+    Rest is kept where |I(x) - J(x)|^2 <= `GAIN` |I(x) - J(x + u)|^2 + rounding, both averaged over a block of the
+    brightness. Errors as of `check_pictures`.
+    """
+    pictures = check_pictures(here, there)
+    one, other = (cv2.cvtColor(np.asarray(each), cv2.COLOR_RGB2GRAY).astype(np.float32) for each in pictures)
+    height, width = one.shape
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    flow = np.asarray(flow_px, np.float32)
+    moved = cv2.remap(other, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    rest, motion = (cv2.blur(np.square(each - one), (BLOCK_PX, BLOCK_PX)) for each in (other, moved))
+    still = rest <= GAIN * motion + _LEAST_VARIANCE
+    return np.where(still[..., None], np.float32(0.0), flow)
