@@ -1,8 +1,8 @@
 """Goller et al.: calibrate on a tag grid, run the scenarios, write both tables, metrics and plots to the run folder.
 
-python -m experiments.simulate benchmark=shop_grid
-python -m experiments.simulate benchmark=shop_exit
+python -m experiments.simulate benchmark=shop_grid     # and shop_exit, shop_handover
 python -m experiments.goller
+python -m experiments.goller handover=recordings/benchmark/shop_handover
 python -m experiments.goller scenarios=<folder of the suite> most=3 fit_steps=0
 """
 

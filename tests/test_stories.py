@@ -21,7 +21,7 @@ from tagjax.sim.world import STEP_S, Material, Shape, rotation_matrix, tag_path
 
 PLAIN = Material((0.5, 0.5, 0.5))
 
-LONG_S = {"enter_leave": 12.0}
+LONG_S = {"enter_leave": 12.0, "shop_handover": 19.0}
 """What cannot be told in the 3 s of the others."""
 
 SMALL = CaptureSettings(width=64, frame_rate_hz=5.0, jitter_s=0.0)

@@ -16,6 +16,7 @@ import yaml
 from tagjax.config import ConfigError, from_mapping
 from tagjax.data.store import open_recording
 from tagjax.recording import RecordingError
+from tagjax.sim._shop import EXIT_X_M
 from tagjax.sim.objects import bounds
 from tagjax.sim.planar import PlanarSettings, open_planar, planar_trials
 from tagjax.sim.raycast import Stage, look_at
@@ -24,7 +25,7 @@ from tagjax.sim.sensors import kinect_v2_intrinsics
 from tagjax.sim.stories import STORIES
 from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, make_suite, prepare, stage_item
 from tagjax.sim.visibility import seen_share, steps_every, stretches
-from tagjax.sim.world import STEP_S
+from tagjax.sim.world import STEP_S, tag_dipole, tag_path
 from tagjax.viz.contact_sheet import save_sheet
 
 FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
@@ -175,6 +176,117 @@ def test_a_film_of_a_door_starts_and_ends_empty():
     last = filmed.world.num_steps - 1
     assert [shown(0), shown(25), shown(last - 25), shown(last)] == [0, 0, 0, 0]
     assert shown(last // 2) > 50
+
+
+def _shop_items(name: str, all_items: bool) -> list:
+    items = _named(name).items()
+    return items if all_items else [item for item in items if item.split == "test" and item.number == 0]
+
+
+@pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_shop_is_as_the_paper_has_it(all_items):
+    """One and the same shop; level tags; still ones on a box near the exit; carried ones leave, or never near the exit."""
+    furniture: dict[str, set] = {}
+    stayed = carried = 0
+    for item in _shop_items("shop_exit", all_items):
+        asked = {"num_still_tags": 0, "num_bystanders": 0, **item.suite.settings, **item.variant.settings}
+        filmed = stage_item(item)
+        world, (exit_antenna, *_) = filmed.world, filmed.antennas_m
+        assert exit_antenna[:2] == (EXIT_X_M, 0.0)
+        assert len(filmed.antennas_m) == 3
+        furniture.setdefault("shop", set()).add(
+            tuple(np.round([body.poses.position_m[0] for body in world.bodies if body.role != "object" and not body.label
+                            and body.role != "person" and body.name != "grey box"], 6).ravel())
+        )  # fmt: skip
+        assert all(tag.dipole[2] == 0 for tag in world.tags), item.name
+        people = [world.bodies[limbs[0]].poses.position_m[:, :2] for limbs in _bodies(filmed).values()]
+        assert len(people) == asked["num_people"] + asked["num_bystanders"]
+        paths = [tag_path(world, tag) for tag in world.tags]
+        still = [path[0] for path in paths if np.ptp(path, axis=0).max() < 0.01]
+        moving = [path for path in paths if np.ptp(path, axis=0).max() >= 0.01]
+        assert len(still) == asked["num_still_tags"]
+        assert len(moving) == asked["num_people"] * asked["tags_each"]
+        for place in still:
+            assert 0.0 < place[0] - EXIT_X_M < asked["still_within_m"] + 0.3, item.name
+            assert place[2] < 1.3
+        for path in moving:
+            stayed += path[:, 0].min() > EXIT_X_M + 0.3
+            carried += 1
+            # Whoever leaves does so before the recording ends, and walks on for half a metre.
+            assert path[:, 0].min() > EXIT_X_M + 0.3 or path[-1, 0] < EXIT_X_M - 0.5, item.name
+        for path in people[asked["num_people"] :]:
+            # A bystander comes near the exit's line and never beyond it.
+            assert EXIT_X_M < path[:, 0].min() < EXIT_X_M + 1.9, item.name
+            assert np.ptp(path[:, 0]) > 0.9
+        for one, other in itertools.combinations(people, 2):
+            assert np.linalg.norm(one - other, axis=1).min() > 0.6, item.name
+        for box in (body for body in world.bodies if body.name == "grey box"):
+            aside = np.abs(np.stack(people) - box.poses.position_m[0, :2]) - box.shapes[0].size_m[:2]
+            assert np.max(aside, axis=-1).min() > 0.25, item.name
+    assert len(furniture["shop"]) == 1
+    assert not all_items or 0.1 < stayed / carried < 0.35
+
+
+@pytest.mark.slow
+def test_the_exit_hears_the_still_tags_all_the_time():
+    """First recordings: at least a read by the exit's antenna in every second, of every tag on the box."""
+    for item in _shop_items("shop_exit", all_items=False):
+        filmed = stage_item(item)
+        still = {tag.epc for tag in filmed.world.tags if np.ptp(tag_path(filmed.world, tag), axis=0).max() < 0.01}
+        if not still:
+            continue
+        capture = dataclasses.replace(item.suite.capture, width=32, frame_rate_hz=2.0)
+        reads = film(filmed, capture, seed=item.seed, name=item.name).reads
+        for epc in still:
+            mine = (reads.epc == epc) & (reads.antenna == 1)
+            second = np.unique(np.floor(reads.time_ns[mine] * 1e-9 - reads.time_ns[0] * 1e-9))
+            assert len(second) > 0.8 * item.suite.duration_s, (item.name, epc)
+
+
+@pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_thing_goes_from_hand_to_hand_and_onto_a_box(all_items):
+    """It is with the first person until they meet, with the second at once after, then at rest, and both leave."""
+    for item in _shop_items("shop_handover", all_items):
+        filmed = stage_item(item)
+        world = filmed.world
+        (tag,) = world.tags
+        assert tag.dipole[2] == 0
+        path = tag_path(world, tag)
+        one, other = (world.bodies[limbs[0]].poses.position_m for limbs in _bodies(filmed).values())
+        near = [np.linalg.norm(path[:, :2] - person[:, :2], axis=1) for person in (one, other)]
+        meet = int(0.25 * item.suite.duration_s / STEP_S)
+        assert near[0][: meet - 20].max() < 0.6, item.name
+        rest = int(np.argmax(np.all(np.abs(path - path[-1]) < 1e-6, axis=1)))
+        assert near[1][meet + 20 : rest].max() < 0.85, item.name
+        # Neither stands about with it: less than a second without a step, from when it is first moved on.
+        start = int(np.argmax(np.linalg.norm(path - path[0], axis=1) > 0.05))
+        carrier = np.where(np.arange(world.num_steps)[:, None] < meet, one, other)[start:rest, :2]
+        pause = np.linalg.norm(np.diff(carrier, axis=0), axis=1) / STEP_S < 0.1
+        pause[meet - start - 1 : meet - start + 1] = True  # from one person to the other is no step
+        assert pause.mean() < 0.45, item.name
+        assert _speed(path).max() < 3.0, item.name
+        assert path[0, 0] < EXIT_X_M + 0.8 < EXIT_X_M + 2.1 < path[meet, 0] + 0.6 < EXIT_X_M + 4.2 < path[-1, 0] + 0.2
+        assert rest * STEP_S < item.suite.duration_s - 6.0
+        assert one[-1, 0] < EXIT_X_M - 0.8 > other[-1, 0]
+        assert np.linalg.norm(one - other, axis=1).min() > 0.6, item.name
+
+
+def test_the_grid_is_a_level_label_both_ways_round():
+    filmed = stage_item(_shop_items("shop_grid", all_items=False)[0])
+    (tag,) = filmed.world.tags
+    path, axis = tag_path(filmed.world, tag), tag_dipole(filmed.world, tag)
+    np.testing.assert_allclose(axis[:, 2], 0, atol=1e-9)
+    rests = np.all(np.abs(np.diff(path, axis=0)) < 1e-9, axis=1)
+    places = np.unique(np.round(path[1:][rests][:, :2], 2), axis=0)
+    assert len(places) == len(np.unique(places[:, 0])) * len(np.unique(places[:, 1])) > 40
+    suite = _named("shop_grid")
+    for place in places:
+        here = np.flatnonzero(rests & np.all(np.abs(path[1:, :2] - place) < 0.01, axis=1))
+        # The last one is kept to the end.
+        here = here[: round(suite.settings["rest_s"] / STEP_S) - 1]
+        along = np.abs(axis[1:][here, 0])
+        assert 0.4 < along.mean() < 0.6
+        np.testing.assert_allclose(along * (1 - along), 0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("name", "variant"), [("planar_tracks", "three"), ("shop_exit", "sp_mt_4")])

@@ -1,4 +1,4 @@
-"""Stories of people who walk, and of a shop: to and fro, in a crowd, out of the exit; and its calibration grid."""
+"""Stories of people who walk: towards the sensor and away, and about in a crowd."""
 
 from __future__ import annotations
 
@@ -7,20 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from ._crowd import is_free
-from ._stage_set import (
-    StageSet,
-    add_still_tags,
-    ease,
-    fitted,
-    trimmed,
-    waved_hand,
-)
-from .motion import num_steps, path_through, random_walks, still_then_move, walk_along
-from .objects import ObjectModel, make_object
+from ._stage_set import StageSet, add_still_tags, trimmed, waved_hand
+from .motion import path_through, random_walks, walk_along
+from .objects import make_object
 from .people import Hands, carried, hold, make_person
 from .record import Filmed
 from .rooms import Room, make_room
-from .world import Poses
 
 KINDS = ("bottle", "box", "toy", "notebook", "bag")
 """What people in a crowd carry: the five objects of the single-object experiments."""
@@ -121,78 +113,3 @@ def crowd(
             stage.object(model, carried(hand, model.grip_m))
     add_still_tags(stage, rng, num_still_tags)
     return stage.filmed(f"{num_people} people walk, {objects_each} objects each")
-
-
-def shop_exit(
-    rng: np.random.Generator,
-    duration_s: float,
-    *,
-    num_people: int = 1,
-    tags_each: int = 1,
-    num_still_tags: int = 0,
-    stay_share: float = 0.5,
-) -> Filmed:
-    """People with tagged things walk about a shop of 3 x 7 m; each leaves through the exit, or stays (`stay_share`)."""
-    if not 1 <= tags_each <= 4:
-        raise ValueError(f"tags_each is {tags_each}; two hands carry 1 to 4 things.")
-    stage = StageSet(make_room("shop_floor", rng), duration_s)
-    room = stage.room
-    x0, _, x1, _ = room.walk_area_m
-    lanes = np.linspace(-0.5, 0.5, num_people) if num_people > 1 else [0.0]
-    for lane in lanes:
-        points = [(rng.uniform(x1 - 1.2, x1), lane, 0.0)]
-        leaves = rng.random() >= stay_share
-        inner = rng.uniform(3.2, 4.2)
-        points.append((inner, lane + rng.uniform(-0.15, 0.15), 0.0))
-        points.append((x0 - 0.9 if leaves else rng.uniform(x1 - 1.5, x1 - 0.3), lane, 0.0))
-        path = path_through(points, speed_m_s=rng.uniform(0.7, 1.2), max_acceleration_m_s2=2.0)
-        walk = trimmed(walk_along(still_then_move(path, rng.uniform(0.0, 1.0))), stage.steps)
-        person = make_person(rng)
-        hands = Hands(
-            right=hold(walk, (0.2, -0.28, 0.95)), left=hold(walk, (0.2, 0.28, 0.95)) if tags_each > 1 else None
-        )
-        motion = stage.person(person, walk, hands)
-        held: list[ObjectModel] = []
-        for number in range(tags_each):
-            model = make_object(str(rng.choice(["bag", "box", "bottle", "toy"])), rng, scale=0.8)
-            hand = (motion.right_hand, motion.left_hand)[number % 2]
-            pose = carried(hand, model.grip_m)
-            lift = _lift(held[number - 2], model) if number > 1 else 0.0
-            stage.object(model, Poses(pose.position_m + np.array([0.0, 0.0, lift]), pose.quaternion))
-            held.append(model)
-    add_still_tags(stage, rng, num_still_tags)
-    return stage.filmed(
-        f"{num_people} people, {tags_each} tags each, {num_still_tags} still", num_antennas=3, rounds_per_antenna=2
-    )
-
-
-def _lift(first: ObjectModel, second: ObjectModel) -> float:
-    """Height to add to the second object of a hand, so that it is just above or below the first."""
-    room = first.half_size_m[2] + second.half_size_m[2] + 0.01
-    grips = second.grip_m[2] - first.grip_m[2]
-    return min(grips + room, grips - room, key=abs)
-
-
-def grid(
-    rng: np.random.Generator, duration_s: float, *, spacing_m: float = 0.5, height_m: float = 1.0, rest_s: float = 2.0
-) -> Filmed:
-    """A tag on a stand that rests at each point of a grid on the shop floor in turn: for antenna calibration."""
-    stage = StageSet(make_room("shop_floor", rng), duration_s)
-    x0, y0, x1, y1 = stage.room.walk_area_m
-    points = [
-        (x, y)
-        for row, x in enumerate(np.arange(x0, x1 + 1e-9, spacing_m))
-        for y in (np.arange(y0, y1 + 1e-9, spacing_m)[:: 1 if row % 2 == 0 else -1])
-    ]
-    model = make_object("box", rng, scale=0.5)
-    path, pause = [], num_steps(rest_s)
-    for number, (x, y) in enumerate(points):
-        path += [(x, y)] * pause
-        if number + 1 < len(points):
-            share = np.linspace(0, 1, 51)[1:-1, None]
-            smooth = ease(share)
-            path += list((1 - smooth) * np.array([x, y]) + smooth * np.array(points[number + 1]))
-    line = fitted(np.array(path), stage.steps)
-    place = np.column_stack([line, np.full(stage.steps, height_m)])
-    stage.object(model, Poses(place, np.broadcast_to([1.0, 0.0, 0.0, 0.0], (stage.steps, 4)).copy()))
-    return stage.filmed("a tag rests at each point of a grid", num_antennas=3, rounds_per_antenna=2)

@@ -14,8 +14,9 @@ import numpy as np
 
 from ._doorway import enter_leave
 from ._held import handheld, handover, put_down
+from ._shop import grid, shop_exit, shop_handover
 from ._tabled import tabletop
-from ._walked import approach, crowd, grid, shop_exit
+from ._walked import approach, crowd
 from .record import Filmed
 
 STORIES: Mapping[str, Callable[..., Filmed]] = {
@@ -27,6 +28,7 @@ STORIES: Mapping[str, Callable[..., Filmed]] = {
     "put_down": put_down,
     "tabletop": tabletop,
     "shop_exit": shop_exit,
+    "shop_handover": shop_handover,
     "grid": grid,
 }
 """What can be told, by name."""

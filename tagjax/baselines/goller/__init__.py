@@ -20,6 +20,9 @@ from ._blobs import BlobSettings as BlobSettings
 from ._blobs import BlobTracker as BlobTracker
 from ._fit import carried as carried
 from ._fit import fit_association as fit_association
+from ._handover import Handover as Handover
+from ._handover import follow as follow
+from ._ladder import ladder as ladder
 from ._location import Location as Location
 from ._location import LocationModel as LocationModel
 from ._location import locate as locate

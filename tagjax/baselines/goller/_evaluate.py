@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -153,13 +153,13 @@ def markdown(first: dict[str, Rates], second: dict[str, Rates]) -> str:
         lines.append(f"| {names[rule]} | {row.num_runs} | " + " | ".join(str(cell) for cell in cells) + " |")
     lines += [
         "",
-        "| scenario | runs | P_D,run | paper | P_D (95 %) | paper | P_FA (95 %) | paper | alarms of carried tags that stay |",
+        "| scenario | runs | P_D,run (95 %) | paper | P_D (95 %) | paper | P_FA (95 %) | paper | alarms of carried tags that stay |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in second.items():
         label, run, detected, false_alarm = PAPER_TABLE_2[name]
         cells = (
-            f"{row.detected_run:.3f}",
+            _cell(row.detected_run, row.num_runs),
             run,
             _cell(row.detected, row.num_leaves),
             detected,
@@ -169,6 +169,23 @@ def markdown(first: dict[str, Rates], second: dict[str, Rates]) -> str:
         )
         lines.append(f"| {label} | {row.num_runs} | " + " | ".join(str(cell) for cell in cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def ladder_markdown(rungs: Mapping[str, Mapping[str, Rates]]) -> str:
+    """P_D / P_FA of every scenario where one sensor, or both, are replaced by the truth."""
+    names = {**{name: label[0] for name, label in PAPER_TABLE_2.items()}, SIMPLE: "SP-ST, 2 still", "all": "all"}
+    columns = [name for name in names if any(name in row for row in rungs.values())]
+    lines = [
+        "| P_D / P_FA | " + " | ".join(names[name] for name in columns) + " |",
+        "|" + "---|" * (1 + len(columns)),
+    ]
+    for rung, row in rungs.items():
+        lines.append(f"| {rung} | " + " | ".join(_pair(row[name]) if name in row else "-" for name in columns) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _pair(row: Rates) -> str:
+    return " / ".join("-" if np.isnan(share) else f"{share:.3f}" for share in (row.detected, row.false_alarm))
 
 
 def _cell(share: float, count: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from ._alarm import Roc
 from ._antennas import AntennaModel, response_db
 from ._evaluate import PAPER_TABLE_1
+from ._handover import Handover, mean_curve
 from ._reads import GridStatistic
 
 _COLOURS = ("0.45", "tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown")
@@ -99,12 +100,13 @@ def association_plot(
     identity: Int[np.ndarray, "time slots"],
     state: Int[np.ndarray, " time"],
     tag_x_m: Shaped[np.ndarray, " time"],
+    true_x_m: Shaped[np.ndarray, " time"],
     *,
     title: str = "",
 ) -> None:
     """Association probability of one tag over time (Fig. 7a): background and every blob; the truth as a band above.
 
-    `state` is the right one (0 background, 1 + slot, -1 not known). Below, the tag's located x.
+    `state` is the right one (0 background, 1 + slot, -1 not known). Below, the tag's x, located and true.
     """
     figure = _figure(8.0, 5.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
@@ -123,10 +125,31 @@ def association_plot(
         upper.fill_between(time_s, 1.03, 1.08, where=band, color=colour, step="mid", linewidth=0)
     upper.set(ylabel="association probability", ylim=(-0.02, 1.1), title=f"{title} (band: truth, where known)")
     upper.legend(loc="center left", fontsize=8)
-    lower.plot(time_s, tag_x_m, "k", linewidth=1.2)
+    lower.plot(time_s, true_x_m, "0.6", linewidth=1.2, label="true")
+    lower.plot(time_s, tag_x_m, "k", linewidth=1.2, label="located")
+    lower.legend(fontsize=8)
     lower.set(xlabel="time (s)", ylabel="tag's x (m)")
     for axes in (upper, lower):
         axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+
+
+def handover_plot(path: Path, found: Sequence[Handover]) -> None:
+    """Mean association probability over recordings by role, aligned at the hand-over; bands: one deviation."""
+    times, mean, deviation = mean_curve(list(found))
+    figure = _figure(8.0, 3.6)
+    axes: Axes = figure.subplots()
+    for role, (name, colour) in enumerate((("background", "0.45"), ("giver", "tab:blue"), ("taker", "tab:orange"))):
+        axes.plot(times, mean[:, role], color=colour, label=name)
+        low, high = mean[:, role] - deviation[:, role], mean[:, role] + deviation[:, role]
+        axes.fill_between(times, np.clip(low, 0, 1), np.clip(high, 0, 1), color=colour, alpha=0.15, linewidth=0)
+    axes.axvline(0, color="k", linewidth=0.8)
+    rest_s = float(np.median([one.rest_s - one.taken_s for one in found]))
+    axes.axvline(rest_s, color="k", linewidth=0.8, linestyle=":")
+    title = f"{len(found)} recordings; line: the tag changes hands, dotted: it rests (median)"
+    axes.set(xlabel="time from the hand-over (s)", ylabel="association probability", ylim=(-0.02, 1.05), title=title)
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
 
 

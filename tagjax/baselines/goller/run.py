@@ -15,7 +15,9 @@ import numpy as np
 
 from ...recording import Recording
 from ._evaluate import (
+    SIMPLE,
     TagOutcome,
+    ladder_markdown,
     location_error_m,
     markdown,
     outcomes,
@@ -25,8 +27,10 @@ from ._evaluate import (
     table_2,
     thresholds,
 )
-from ._figures import antenna_plot, association_plot, roc_plot, scene_picture
+from ._figures import antenna_plot, association_plot, handover_plot, roc_plot, scene_picture
 from ._fit import Carried, carried, fit_association, true_states
+from ._handover import Handover, follow
+from ._ladder import ladder
 from ._reads import grid_statistic
 from ._site import find_site
 from ._system import Calibration, GollerSettings, Observations, calibrate, decide, observe, save_calibration
@@ -41,7 +45,7 @@ class GollerConfig:
 
     grid: str  # a recording
     scenarios: str  # a suite's folder with train/, validation/ and test/
-    handover: str | None = None  # a recording
+    handover: str | None = None  # a recording, or a suite's folder with test/
     settings: GollerSettings = dataclasses.field(default_factory=GollerSettings)
     floor_dbm: float = -80.0
     fit_means: bool = False
@@ -110,12 +114,16 @@ def run_goller(
     found = _outcomes(calibration, splits["test"], settings)
     decided_ms = 1e3 * (time.perf_counter() - start) / max(sum(len(s.time_s) for _, s, _ in splits["test"]), 1)
     first, second = table_1(found, fused, rfid), table_2(found, fused)
-    (folder / "tables.md").write_text(markdown(first, second))
-    _plots(folder, config, calibration, found, first, open_recording)
+    rungs = ladder(calibration, splits["train"] + splits["validation"], splits["test"], settings)
+    (folder / "tables.md").write_text(markdown(first, second) + "\n" + ladder_markdown(rungs))
+    _curves(folder, found, first)
+    passed = _handovers(folder, config, calibration, open_recording)
     errors = location_error_m(calibration, [(seen, truth) for _, seen, truth in splits["test"]], settings)
     metrics = {
         "table_1": {name: plain(row) for name, row in first.items()},
         "table_2": {name: plain(row) for name, row in second.items()},
+        "ladder": {rung: {name: plain(row) for name, row in rows.items()} for rung, rows in rungs.items()},
+        "handover": passed,
         "thresholds": {"fused": fused, "rfid_dbm": rfid},
         "fitted": _fitted(calibration),
         "fit_loss": [float(losses[0]), float(losses[-1])] if len(losses) else None,
@@ -147,45 +155,65 @@ def _fitted(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _plots(
-    folder: Path,
-    config: GollerConfig,
-    calibration: Calibration,
-    found: list[TagOutcome],
-    first: dict[str, Any],
-    open_recording: Callable[[str], Recording],
-) -> None:
-    simple = [one for one in found if one.variant == "sp_st_still"]
-    if {"leaves", "still"} <= {one.kind for one in simple}:
-        curves = {
-            "RFID only": rule_roc(simple, "rfid", stays=False),
-            "RFID + CV": rule_roc(simple, "fused", stays=False),
-        }
-        rows = {"RFID only": first["rfid"], "RFID + CV": first["fused"]}
-        roc_plot(folder / "roc.png", curves, {name: (row.detected, row.false_alarm) for name, row in rows.items()})
-    if config.handover is None:
+def _curves(folder: Path, found: list[TagOutcome], first: dict[str, Any]) -> None:
+    """Table I as a curve, where its scenario was recorded."""
+    simple = [one for one in found if one.variant == SIMPLE]
+    if not {"leaves", "still"} <= {one.kind for one in simple}:
         return
-    recording = open_recording(config.handover)
-    seen, truth = observe(recording, config.settings), carried(recording)
-    decision, states = decide(calibration, seen, config.settings), true_states(seen, truth)
-    for row, epc in enumerate(seen.epcs):
-        association_plot(
-            folder / ("handover.png" if row == 0 else f"handover_{row + 1}.png"),
-            seen.time_s,
-            np.asarray(decision.probability[row]),
-            seen.blobs.identity,
-            states[row],
-            np.asarray(decision.location.position_m[row, :, 0]),
-            title=f"{recording.name}, tag {epc[-4:]}",
-        )
-    _scene(
-        folder / "handover_scene.png",
-        recording,
-        seen,
-        np.asarray(decision.probability),
-        np.asarray(decision.exit_score),
-        float(calibration.alarm_threshold),
-    )
+    curves = {
+        "RFID only": rule_roc(simple, "rfid", stays=False),
+        "RFID + CV": rule_roc(simple, "fused", stays=False),
+    }
+    rows = {"RFID only": first["rfid"], "RFID + CV": first["fused"]}
+    roc_plot(folder / "roc.png", curves, {name: (row.detected, row.false_alarm) for name, row in rows.items()})
+
+
+def _handovers(
+    folder: Path, config: GollerConfig, calibration: Calibration, open_recording: Callable[[str], Recording]
+) -> dict[str, Any] | None:
+    """Fig. 7 for every tag of the first recording, and what all recordings have in common; None without any."""
+    if config.handover is None:
+        return None
+    home = Path(config.handover) / "test"
+    paths = sorted(str(path) for path in home.glob("*.zarr")) if home.is_dir() else [config.handover]
+    if not paths:
+        raise ValueError(f"{home}: no recording of a hand-over. Simulate the suite: experiments.simulate.")
+    followed: list[Handover] = []
+    for number, path in enumerate(paths):
+        recording = open_recording(path)
+        seen, truth = observe(recording, config.settings), carried(recording)
+        decision, states = decide(calibration, seen, config.settings), true_states(seen, truth)
+        for row, epc in enumerate(seen.epcs):
+            probability, place = np.asarray(decision.probability[row]), truth.position_m[truth.epcs.index(epc)]
+            one = follow(seen.time_s, place, probability, seen.blobs)
+            followed += [] if one is None else [one]
+            if number == 0:
+                association_plot(
+                    folder / ("handover.png" if row == 0 else f"handover_{row + 1}.png"),
+                    seen.time_s,
+                    probability,
+                    seen.blobs.identity,
+                    states[row],
+                    np.asarray(decision.location.position_m[row, :, 0]),
+                    place[:, 0],
+                    title=f"{recording.name}, tag {epc[-4:]}",
+                )
+        if number == 0:
+            scores, threshold = np.asarray(decision.exit_score), float(calibration.alarm_threshold)
+            _scene(folder / "handover_scene.png", recording, seen, np.asarray(decision.probability), scores, threshold)
+    if not followed:
+        return {"num_recordings": len(paths), "num_followed": 0}
+    handover_plot(folder / "handover_mean.png", followed)
+    delays = {"taker": [one.delay_s for one in followed], "rest": [one.rest_delay_s for one in followed]}
+    return {
+        "num_recordings": len(paths),
+        "num_followed": len(followed),
+        "giver_peak_before": [float(one.probability[one.time_s <= one.taken_s, 1].max()) for one in followed],
+        "taker_peak_before": [float(one.probability[one.time_s <= one.taken_s, 2].max()) for one in followed],
+        "taker_peak_after": [float(one.probability[one.time_s > one.taken_s, 2].max()) for one in followed],
+        "background_at_end": [float(one.probability[-1, 0]) for one in followed],
+        **{f"{name}_delay_s": [d if np.isfinite(d) else None for d in values] for name, values in delays.items()},
+    }
 
 
 def _scene(path, recording, seen, probability, score, threshold) -> None:

@@ -1,0 +1,42 @@
+"""Which of several real tracks carries a (virtual) tag: accuracy of every method's association score by window length.
+
+python -m experiments.tracks folder=<folder with kinect-rfid/ and xovis-uwb/>
+python -m experiments.tracks folder=<...> 'windows_s=[2,4]' most=10 noise_m=0.05
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from .train import CONFIGS, resolved
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="tracks")
+def main(config: DictConfig) -> None:
+    from rich.console import Console
+
+    from tagjax.config import from_mapping
+    from tagjax.evaluation.tracks import TracksConfig, run_tracks
+    from tagjax.recording import RecordingError
+
+    values = resolved(config)
+    if values.get("folder") is None:
+        raise SystemExit("tracks: name a folder with kinect-rfid/ or xovis-uwb/: folder=<...>.")
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+    console = Console()
+    try:
+        with console.status("scoring", spinner="line") as status:
+            run_tracks(from_mapping(TracksConfig, values), folder, on_done=status.update)
+    except (RecordingError, ValueError) as error:
+        raise SystemExit(f"tracks: {error}") from error
+    console.print((folder / "tables.md").read_text(), markup=False)
+    console.print(f"run folder: {folder}")
+
+
+if __name__ == "__main__":
+    main()

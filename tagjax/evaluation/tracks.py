@@ -1,0 +1,309 @@
+"""Which of several real tracks carries a tag: each method's association score, by the length of the window it sees.
+
+A virtual tag (`sim.virtual_tag`) is put on each person in turn. What the methods are given of a track is the track with
+noise of its own, so that the carrier's is not the tag's path to the letter.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Shaped
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ..attention import att_corr, att_rbf, attention, coherent_score
+from ..baselines.tagview import ReadSettings, fit_pairs, hear
+from ..baselines.tagvision import Snapshots, match_scores
+from ..recording import RecordingError, TagReads
+from ..rf.channels import estimate_slope
+from ..rf.windows import phase_reads, radio_windows
+from ..sim.reader import ReaderSettings
+from ..sim.virtual_tag import Track, virtual_reads
+
+METHODS = ("TagAttention, coherent", "TagAttention, Eqs. 4-6", "TagVision", "Tagview")
+"""Whose scores are asked. Goller et al. need RSSI at several antennas and a calibration, which tracks do not have."""
+
+_NUM_WINDOW, _ALPHA_M2, _BETA = 5, 5e-4, 0.8  # TagAttention's
+_EPC = "virtual"
+
+
+@dataclasses.dataclass(frozen=True)
+class TracksConfig:
+    """What a run needs, beside the folder of tracks."""
+
+    folder: str  # holds kinect-rfid/ or xovis-uwb/, or both
+    windows_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
+    frame_rate_hz: float = 15.0  # tracks are brought to it
+    noise_m: float = 0.02  # standard deviation of a track's noise, by frame and axis
+    least_move_m: float = 0.16  # half a wavelength: windows in which the tag's distance changes by less are left out
+    most: int = 40  # windows of each length and scene
+    xovis_unit_m: float = 0.02
+    region: str = "fcc"
+    flip_share: float = 0.08
+    seed: int = 0
+
+    def __post_init__(self):
+        if not self.windows_s or min(self.windows_s) * self.frame_rate_hz < _NUM_WINDOW:
+            raise ValueError(
+                f"windows_s is {self.windows_s} at {self.frame_rate_hz} frames/s; at least {_NUM_WINDOW} frames are needed."
+            )
+        if self.noise_m < 0 or self.most < 1 or not self.xovis_unit_m > 0:
+            raise ValueError(
+                f"noise_m {self.noise_m}, most {self.most}, xovis_unit_m {self.xovis_unit_m}; expected not negative, at least "
+                "1, and positive."
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """People's tracks on one clock, as if all of them were there at a time; NaN where one is not."""
+
+    name: str
+    time_s: Float[np.ndarray, " time"]
+    position_m: Float[np.ndarray, "people time 2"]  # on the floor
+
+
+def _scene(name: str, tracks: Sequence[tuple[np.ndarray, np.ndarray]], rate_hz: float) -> Scene:
+    """Each track from its own first sample on, at even times."""
+    longest = max(times[-1] - times[0] for times, _ in tracks)
+    clock = np.arange(0.0, longest + 1e-9, 1.0 / rate_hz)
+    out = np.full((len(tracks), len(clock), 2), np.nan)
+    for row, (times, place) in enumerate(tracks):
+        own, first = np.unique(times - times[0], return_index=True)
+        inside = clock <= own[-1]
+        for axis in range(2):
+            out[row, inside, axis] = np.interp(clock[inside], own, place[first, axis])
+    return Scene(name, clock, out)
+
+
+def load_kinect(folder: Path, rate_hz: float) -> Scene:
+    """All skeleton tracks of a folder (id, time, x cm, z cm), recorded one or two at a time, put side by side."""
+    tracks = []
+    for path in sorted(folder.glob("[0-9]*.txt")):
+        rows: dict[str, list[tuple[float, float, float]]] = {}
+        for line, text in enumerate(path.read_text().splitlines(), start=1):
+            try:
+                who, stamp, x_cm, z_cm = (part.strip() for part in text.split(","))
+                second = datetime.strptime(stamp, "%Y-%m-%d %H:%M:%S:%f").timestamp()
+                rows.setdefault(who, []).append((second, float(x_cm) / 100, float(z_cm) / 100))
+            except ValueError as error:
+                raise RecordingError(f"{path}, line {line}: {error}. Expected id, time, x cm, z cm.") from error
+        tracks += [(np.array(own)[:, 0], np.array(own)[:, 1:]) for own in rows.values() if len(own) > 1]
+    if len(tracks) < 2:
+        raise RecordingError(f"{folder}: {len(tracks)} tracks; association needs two or more.")
+    return _scene("kinect-rfid", tracks, rate_hz)
+
+
+def load_xovis(path: Path, rate_hz: float, unit_m: float) -> Scene:
+    """All tracks of a table ;time;id;x;y;... (ms; x and y in units of `unit_m`), put side by side."""
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    with path.open(newline="") as file:
+        table = csv.DictReader(file, delimiter=";")
+        missing = {"time", "id", "x", "y"} - set(table.fieldnames or ())
+        if missing:
+            raise RecordingError(f"{path}: columns {', '.join(sorted(missing))} are missing; found {table.fieldnames}.")
+        for row in table:
+            place = float(row["x"]) * unit_m, float(row["y"]) * unit_m
+            rows.setdefault(row["id"], []).append((float(row["time"]) * 1e-3, *place))
+    tracks = [(np.array(own)[:, 0], np.array(own)[:, 1:]) for own in rows.values() if len(own) > 1]
+    if len(tracks) < 2:
+        raise RecordingError(f"{path}: {len(tracks)} tracks; association needs two or more.")
+    return _scene("xovis-uwb", tracks, rate_hz)
+
+
+def load_scenes(config: TracksConfig) -> list[Scene]:
+    """What there is in the folder. Raises `RecordingError` where there is nothing."""
+    folder, found = Path(config.folder), []
+    if (folder / "kinect-rfid").is_dir():
+        found.append(load_kinect(folder / "kinect-rfid", config.frame_rate_hz))
+    table = folder / "xovis-uwb" / "raw_xovis.csv"
+    if table.is_file():
+        found.append(load_xovis(table, config.frame_rate_hz, config.xovis_unit_m))
+    if not found:
+        raise RecordingError(f"{folder}: neither kinect-rfid/ nor xovis-uwb/raw_xovis.csv; name the folder of tracks.")
+    return found
+
+
+def antenna_place(scene: Scene) -> Float[np.ndarray, " 3"]:
+    """Where the antenna stands: a metre before the people's floor, off its middle, as high as the tags."""
+    low, high = np.nanmin(scene.position_m, axis=(0, 1)), np.nanmax(scene.position_m, axis=(0, 1))
+    return np.array([low[0] - 1.0, 0.7 * low[1] + 0.3 * high[1], 0.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """What the methods are given: the candidates' distances at the frames, and the reads of one tag."""
+
+    time_s: Float[np.ndarray, " frames"]
+    distance_m: Float[np.ndarray, "people frames"]
+    reads: TagReads
+    carrier: int  # whose tag it is
+
+
+def windows(scene: Scene, length_s: float, config: TracksConfig) -> list[Window]:
+    """Windows of a length, at most `config.most` spread over tags and times, each with two people or more."""
+    rng = np.random.default_rng([config.seed, len(scene.name)])
+    antenna, found = antenna_place(scene), []
+    three = lambda place: np.concatenate([place, np.zeros((*place.shape[:-1], 1))], axis=-1)  # noqa: E731
+    num = round(length_s * config.frame_rate_hz)
+    settings = ReaderSettings(region=config.region, flip_share=config.flip_share)
+    true_m = np.linalg.norm(three(scene.position_m) - antenna, axis=-1)
+    noisy = scene.position_m + config.noise_m * rng.normal(size=scene.position_m.shape)
+    seen_m = np.linalg.norm(three(noisy) - antenna, axis=-1)
+    for person, place in enumerate(scene.position_m):
+        reads = virtual_reads(
+            Track(scene.time_s, three(place)), _EPC, settings, seed=config.seed + person, antenna_m=antenna
+        )
+        for start in range(0, len(scene.time_s) - num, max(num // 2, 1)):
+            span = slice(start, start + num)
+            here = np.all(np.isfinite(true_m[:, span]), axis=1)
+            if not here[person] or here.sum() < 2 or np.ptp(true_m[person, span]) < config.least_move_m:
+                continue
+            first, last = scene.time_s[start], scene.time_s[start + num - 1]
+            inside = (reads.time_ns >= first * 1e9) & (reads.time_ns <= last * 1e9)
+            own = dataclasses.replace(reads[inside], time_ns=reads.time_ns[inside] - round(first * 1e9))
+            carrier = int(np.sum(here[:person]))
+            found.append(Window(scene.time_s[span] - first, seen_m[here][:, span], own, carrier))
+    chosen = np.linspace(0, len(found) - 1, min(len(found), config.most)).round().astype(int) if found else []
+    return [found[i] for i in chosen]
+
+
+def association_scores(window: Window, *, seed: int = 0) -> dict[str, Float[np.ndarray, " people"]]:
+    """Every method's score of every candidate; all 0 where a method has nothing to go by."""
+    people = len(window.distance_m)
+    if window.reads.num_reads < 4:
+        return {name: np.zeros(people) for name in METHODS}
+    frames, distance = jnp.asarray(window.time_s, jnp.float32), jnp.asarray(window.distance_m, jnp.float32)
+    flips = bool(window.reads.pi_flips)
+    reads = phase_reads(window.reads, _EPC, 0)
+    coherent = coherent_score(distance[None], reads, frames, doubled_angle=flips)[0]
+    radio = radio_windows(reads, frames, _NUM_WINDOW)
+    attended = _attended(distance, radio.relative_m, radio.std_m)
+    stamp = window.reads.time_ns * 1e-9
+    carrier = window.reads.carrier_hz
+    channel = np.unique(carrier, return_inverse=True)[1].reshape(-1)
+    slope = estimate_slope(window.reads.phase_rad, stamp, channel, carrier).slope_rad_hz
+    snapshots = Snapshots(
+        jnp.asarray(window.reads.phase_rad, jnp.float32),
+        jnp.asarray(carrier, jnp.float32),
+        jnp.asarray(np.stack([np.interp(stamp, window.time_s, one) for one in window.distance_m]), jnp.float32),
+        jnp.ones((people, len(stamp)), bool),
+    )
+    vision = match_scores(
+        snapshots,
+        key=jax.random.key(seed),
+        num_rounds=30,
+        multiple=2 if flips else 1,
+        hop_slope_rad_hz=jnp.asarray(slope, jnp.float32),
+    )
+    said = hear([_EPC], window.reads, stamp, window.time_s, ReadSettings()).sequences
+    # Tagview's factor is the distance in units of the antenna's height; R^2 does not ask for the unit.
+    fit = fit_pairs(distance, jnp.ones(distance.shape, bool), said.phase_rad, said.heard, said.piece)
+    line = jnp.where(fit.slope[:, 0] > 0, fit.r_squared[:, 0], 0.0)
+    return dict(zip(METHODS, (np.asarray(x, np.float64) for x in (coherent, attended, vision, line)), strict=True))
+
+
+@jax.jit
+def _attended(
+    distance_m: Float[Array, "people frames"],
+    relative_m: Float[Array, "frames window"],
+    std_m: Float[Array, "frames window"],
+) -> Float[Array, " people"]:
+    """Att_RF (Eqs. 4-6) of every sliding window of k frames that the radio knows, averaged."""
+    num = distance_m.shape[1]
+    index = jnp.arange(_NUM_WINDOW - 1, num)[:, None] - jnp.arange(_NUM_WINDOW - 1, -1, -1)[None, :]
+    rho = distance_m[:, index] - distance_m[:, index[:, :1]]
+    rd = relative_m[_NUM_WINDOW - 1 :]
+    known = jnp.all(jnp.isfinite(std_m[_NUM_WINDOW - 1 :]), axis=1)
+    valid = jnp.broadcast_to(known[None, :, None], rho.shape)
+    rd = jnp.broadcast_to(rd[None], rho.shape)
+    rbf = att_rbf(rho, rd, valid, jnp.full(rho.shape[:2], _ALPHA_M2, rho.dtype))
+    score = attention(rbf, att_corr(rho, rd, valid), jnp.asarray(_BETA, rho.dtype))
+    share = known.astype(rho.dtype)[None]
+    return jnp.sum(share * score, axis=1) / jnp.maximum(jnp.sum(share), 1.0)
+
+
+def right(score: Shaped[np.ndarray, " people"], carrier: int) -> float:
+    """1 where the carrier has the highest score, a share of it where several have; so that nothing scores chance."""
+    best = np.asarray(score) >= np.max(score)
+    return float(best[carrier]) / float(best.sum())
+
+
+def run_tracks(config: TracksConfig, folder: Path, *, on_done: Callable[[str], None] = print) -> dict[str, Any]:
+    """Accuracy of every method by scene and window length; writes `metrics.json`, `tables.md` and `accuracy.png`."""
+    rows = []
+    for scene in load_scenes(config):
+        for length_s in config.windows_s:
+            seen = windows(scene, length_s, config)
+            if not seen:
+                continue
+            marks: dict[str, list[float]] = {name: [] for name in METHODS}
+            for number, window in enumerate(seen):
+                for name, score in association_scores(window, seed=number).items():
+                    marks[name].append(right(score, window.carrier))
+            rows.append(
+                {
+                    "scene": scene.name,
+                    "window_s": length_s,
+                    "num_windows": len(seen),
+                    "candidates": float(np.mean([len(one.distance_m) for one in seen])),
+                    "chance": float(np.mean([1 / len(one.distance_m) for one in seen])),
+                    "accuracy": {name: float(np.mean(values)) for name, values in marks.items()},
+                }
+            )
+            on_done(f"{scene.name}, {length_s:g} s")
+    (folder / "metrics.json").write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+    (folder / "tables.md").write_text(markdown(rows))
+    _plot(folder / "accuracy.png", rows)
+    return {"rows": rows}
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """One row for each scene and window length."""
+    lines = [
+        "| scene | window (s) | windows | candidates | chance | " + " | ".join(METHODS) + " |",
+        "|" + "---|" * (5 + len(METHODS)),
+    ]
+    for row in rows:
+        cells = [
+            row["scene"],
+            f"{row['window_s']:g}",
+            row["num_windows"],
+            f"{row['candidates']:.1f}",
+            f"{row['chance']:.2f}",
+        ]
+        cells += [f"{row['accuracy'][name]:.2f}" for name in METHODS]
+        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _plot(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    figure = Figure(figsize=(4.2 * max(len(names), 1), 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, name in zip(np.atleast_1d(figure.subplots(1, max(len(names), 1), sharey=True)), names, strict=False):
+        mine = [row for row in rows if row["scene"] == name]
+        length = [row["window_s"] for row in mine]
+        for method in METHODS:
+            axes.plot(length, [row["accuracy"][method] for row in mine], "o-", label=method, markersize=4)
+        axes.plot(length, [row["chance"] for row in mine], "k:", label="chance")
+        axes.set(
+            xlabel="window (s)", ylim=(0, 1.03), xscale="log", xticks=length, xticklabels=[f"{s:g}" for s in length]
+        )
+        axes.set_title(name, fontsize=9)
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    if names:
+        figure.axes[0].set_ylabel("carrier has the highest score")
+        figure.axes[0].legend(fontsize=7, loc="lower right")
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,172 @@
+"""Association scores on tracks: loaders, windows, and what each method says of synthetic walks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from tagjax.config import from_mapping
+from tagjax.evaluation.tracks import (
+    METHODS,
+    TracksConfig,
+    antenna_place,
+    association_scores,
+    load_kinect,
+    load_scenes,
+    load_xovis,
+    right,
+    run_tracks,
+    windows,
+)
+from tagjax.recording import RecordingError
+
+RATE_HZ = 15.0
+
+
+def _walks(seconds: float = 16.0, rate_hz: float = 30.0) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Two circles of other speeds and phases, and one who stands."""
+    time_s = np.arange(0, seconds, 1 / rate_hz)
+    circle = lambda radius, turn_hz, start: np.stack(  # noqa: E731
+        [
+            2 + radius * np.cos(2 * np.pi * turn_hz * time_s + start),
+            radius * np.sin(2 * np.pi * turn_hz * time_s + start),
+        ],
+        axis=-1,
+    )
+    return time_s, [circle(0.8, 0.12, 0.0), circle(0.7, 0.1, 2.0), np.broadcast_to([3.0, 0.5], (len(time_s), 2))]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    home = tmp_path_factory.mktemp("tracks")
+    time_s, paths = _walks()
+    (home / "kinect-rfid").mkdir()
+    begin = datetime(2020, 5, 1, 12, 0, 0)
+    for number, path in enumerate(paths):
+        lines = []
+        for second, (x, z) in zip(time_s, path, strict=True):
+            stamp = begin + timedelta(seconds=100.0 * number + second)
+            text = stamp.strftime("%Y-%m-%d %H:%M:%S") + f":{stamp.microsecond // 1000:03d}"
+            lines.append(f"7{number}, {text}, {100 * x}, {100 * z}")
+        (home / "kinect-rfid" / f"{number + 1}-5-2020.txt").write_text("\n".join(lines) + "\n")
+    (home / "kinect-rfid" / "RFID_1-5-2020.txt").write_text("no track\n")
+    (home / "xovis-uwb").mkdir()
+    rows = [";time;id;x;y;height;cam"]
+    for number, path in enumerate(paths[:2]):
+        rows += [
+            f"{k};{1000 * second + 5e5 * number};{number};{x / 0.02};{y / 0.02};1700;c"
+            for k, (second, (x, y)) in enumerate(zip(time_s, path, strict=True))
+            if k % 6 == 0
+        ]
+    (home / "xovis-uwb" / "raw_xovis.csv").write_text("\n".join(rows) + "\n")
+    return home
+
+
+def test_tracks_are_put_side_by_side_on_one_clock(folder):
+    _, paths = _walks()
+    kinect = load_kinect(folder / "kinect-rfid", RATE_HZ)
+    xovis = load_xovis(folder / "xovis-uwb" / "raw_xovis.csv", RATE_HZ, 0.02)
+    assert (len(kinect.position_m), len(xovis.position_m)) == (3, 2)
+    # Every second sample of the walks' 30 a second; the table's 5 a second are joined by straight lines.
+    for scene, atol in ((kinect, 2e-3), (xovis, 0.02)):
+        for found, path in zip(scene.position_m, paths, strict=False):
+            there = np.all(np.isfinite(found), axis=1)
+            assert there.sum() > 230
+            np.testing.assert_allclose(found[there], path[::2][: there.sum()], atol=atol)
+
+
+def test_windows_are_those_in_which_the_carrier_moves(folder):
+    config = TracksConfig(str(folder), frame_rate_hz=RATE_HZ, most=1000, noise_m=0.0)
+    scene = load_kinect(folder / "kinect-rfid", RATE_HZ)
+    found = windows(scene, 2.0, config)
+    assert {window.carrier for window in found} == {0, 1}
+    for window in found:
+        assert window.distance_m.shape == (3, 30)
+        assert np.ptp(window.distance_m[window.carrier]) >= config.least_move_m
+        assert np.ptp(window.distance_m[2]) < 1e-9
+        stamps = window.reads.time_ns * 1e-9
+        assert stamps.min() >= 0
+        assert stamps.max() <= window.time_s[-1] + 1e-9
+        assert 30 < window.reads.num_reads < 130
+    assert len(windows(scene, 2.0, dataclasses.replace(config, most=5))) == 5
+    antenna = antenna_place(scene)
+    reach = np.linalg.norm(
+        np.concatenate([scene.position_m, np.zeros((*scene.position_m.shape[:2], 1))], -1) - antenna, axis=-1
+    )
+    np.testing.assert_allclose(
+        found[0].distance_m[:, 0], reach[:, np.argmin(np.abs(reach[0] - found[0].distance_m[0, 0]))], atol=0.05
+    )
+    noisy = windows(scene, 2.0, dataclasses.replace(config, noise_m=0.02))
+    apart = np.concatenate([(a.distance_m - b.distance_m).ravel() for a, b in zip(found, noisy, strict=True)])
+    assert 0.015 < apart.std() < 0.025
+
+
+def test_ties_count_for_their_share():
+    assert right(np.array([0.2, 0.9, 0.1]), 1) == 1.0
+    assert right(np.array([0.2, 0.9, 0.1]), 0) == 0.0
+    assert right(np.zeros(4), 2) == 0.25
+
+
+def test_a_silent_tag_scores_nothing(folder):
+    config = TracksConfig(str(folder), frame_rate_hz=RATE_HZ, most=1)
+    (window,) = windows(load_kinect(folder / "kinect-rfid", RATE_HZ), 2.0, config)
+    silent = dataclasses.replace(window, reads=window.reads[:2])
+    assert all(not score.any() for score in association_scores(silent).values())
+
+
+def test_what_is_no_folder_of_tracks_is_refused(folder, tmp_path):
+    with pytest.raises(RecordingError, match="neither kinect-rfid"):
+        load_scenes(TracksConfig(str(tmp_path)))
+    (tmp_path / "kinect-rfid").mkdir()
+    with pytest.raises(RecordingError, match="0 tracks"):
+        load_scenes(TracksConfig(str(tmp_path)))
+    (tmp_path / "kinect-rfid" / "1-1-2020.txt").write_text("7, yesterday, 1, 2\n")
+    with pytest.raises(RecordingError, match=r"line 1.*Expected id, time"):
+        load_scenes(TracksConfig(str(tmp_path)))
+    (tmp_path / "t.csv").write_text(";time;id;x\n")
+    with pytest.raises(RecordingError, match="columns y are missing"):
+        load_xovis(tmp_path / "t.csv", RATE_HZ, 0.02)
+    with pytest.raises(ValueError, match="at least 5 frames"):
+        TracksConfig("x", windows_s=(0.1,))
+    with pytest.raises(ValueError, match="noise_m -1"):
+        TracksConfig("x", noise_m=-1.0)
+
+
+def test_the_configuration_names_every_setting():
+    values: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "conf" / "tracks.yaml").read_text())
+    values.pop("hydra")
+    assert from_mapping(TracksConfig, {**values, "folder": "x"}) == TracksConfig("x")
+    assert set(values) == {field.name for field in dataclasses.fields(TracksConfig)}
+
+
+@pytest.mark.slow
+def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path):
+    """Without noise, flips or hops a window of 4 s suffices for all of them; a run writes what it found."""
+    config = TracksConfig(
+        str(folder), windows_s=(4.0,), frame_rate_hz=RATE_HZ, most=6, noise_m=0.0, flip_share=0.0, region="fixed"
+    )
+    rows = run_tracks(config, tmp_path, on_done=lambda name: None)["rows"]
+    assert [row["scene"] for row in rows] == ["kinect-rfid", "xovis-uwb"]
+    for row in rows:
+        assert set(row["accuracy"]) == set(METHODS)
+        assert min(row["accuracy"].values()) == 1.0, row
+        assert row["chance"] == pytest.approx(1 / row["candidates"])
+    assert json.loads((tmp_path / "metrics.json").read_text()) == rows
+    assert (tmp_path / "accuracy.png").stat().st_size > 0
+    assert "| kinect-rfid | 4 | 6 |" in (tmp_path / "tables.md").read_text()
+
+
+@pytest.mark.real_data
+@pytest.mark.slow
+def test_real_tracks_tell_the_carrier_better_the_longer_one_looks(real_data, tmp_path):
+    rows = run_tracks(TracksConfig(str(real_data / "tracks"), windows_s=(1.0, 4.0), most=16), tmp_path)["rows"]
+    assert {row["scene"] for row in rows} == {"kinect-rfid", "xovis-uwb"}
+    for row in rows:
+        assert row["accuracy"][METHODS[0]] > row["chance"]
