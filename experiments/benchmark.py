@@ -2,6 +2,7 @@
 
 python -m experiments.benchmark
 python -m experiments.benchmark flow
+python -m experiments.benchmark training    # a training step against the clip's length; minutes
 python -m experiments.benchmark 'cases=[gather,splat]' repeats=21
 """
 

@@ -18,7 +18,7 @@ from .train import CONFIGS, resolved
 
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="evaluate_flow")
-def main(config: DictConfig) -> None:
+def main(config: DictConfig) -> float:
     from rich.console import Console
 
     from tagjax.config import from_mapping
@@ -38,6 +38,9 @@ def main(config: DictConfig) -> None:
     console.print(f"report: {folder}", soft_wrap=True, highlight=False)
     found = {name: {flow: s["all"] for flow, s in flows.items()} for name, flows in summary["materials"].items()}
     print(json.dumps(plain(found), allow_nan=False))
+    # The objective of a sweep: the last flow named, on the first material, end-point error in pixels.
+    errors_px = [scores.get("epe_px") for scores in next(iter(found.values()), {}).values()]
+    return float("nan") if not errors_px or errors_px[-1] is None else float(errors_px[-1])
 
 
 if __name__ == "__main__":

@@ -3,10 +3,12 @@
 python -m experiments.train
 python -m experiments.train 'data.recordings=[a.zarr,b.zarr]' 'data.validation=[c.zarr]' loop.num_steps=200
 python -m experiments.train -m optimizer.learning_rate=0.01,0.03 hydra/launcher=joblib
+python -m experiments.train -m search=optuna                          # started again, a killed sweep goes on
 """
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,31 @@ def resolved(config: DictConfig) -> dict[str, Any]:
     """Plain values: nothing of Hydra or OmegaConf enters the library."""
     values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(values, dict)
-    return {str(key): value for key, value in values.items()}
+    return {str(key): value for key, value in values.items() if key != "num_trials"}  # which is the sweep's
+
+
+def trials_left(wanted: int, storage: str, study: str, folder: str) -> int:
+    """How many trials an Optuna study still lacks: a sweep that was killed does these when it is started again.
+
+    Only trials that were finished count; one that was killed stays among them as running, and is tried no more.
+    `folder` is the sweep's, in which Hydra writes the best trial also where none is left to do.
+    """
+    import optuna
+
+    optuna.logging.set_verbosity(logging.WARNING)
+    if storage.startswith("sqlite:///"):
+        Path(storage.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
+    known = {one.study_name for one in optuna.get_all_study_summaries(storage)}
+    if study not in known:
+        return wanted
+    trials = optuna.load_study(study_name=study, storage=storage).trials
+    left = max(0, wanted - sum(trial.state is optuna.trial.TrialState.COMPLETE for trial in trials))
+    if not left:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    return left
+
+
+OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
 
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train")

@@ -22,6 +22,7 @@ from .training.flow_sources import FlowDataSettings
 from .training.logging import LoggerSettings
 from .training.loop import LoopSettings
 from .training.loss import ObjectiveSettings
+from .training.processes import DistributedSettings
 
 TARGET_PREFIXES = ("tagjax.", "optax.")
 
@@ -44,6 +45,7 @@ class ClipSettings:
     antenna: int | None = None  # that distances are to; the one with the most reads if None
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
+    workers: int = 0  # processes that load training clips; with none a thread does
 
     def __post_init__(self) -> None:
         check_clip(stride=self.stride, window=self.window, max_reads=self.max_reads)
@@ -107,6 +109,7 @@ class TrainConfig:
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
     loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)
     logger: LoggerSettings = dataclasses.field(default_factory=LoggerSettings)
+    distributed: DistributedSettings = dataclasses.field(default_factory=DistributedSettings)
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 
 
@@ -126,6 +129,7 @@ class TrainFlowConfig:
     loss: FlowLossSettings = dataclasses.field(default_factory=FlowLossSettings)
     loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)
     logger: LoggerSettings = dataclasses.field(default_factory=LoggerSettings)
+    distributed: DistributedSettings = dataclasses.field(default_factory=DistributedSettings)
 
     def __post_init__(self) -> None:
         if self.average_over < 1:

@@ -179,7 +179,7 @@ class TagAttention(AbstractTracer):
         profile: float = 1.0,
         slack: float = 0.05,
         noise_share: float = 0.1,
-        rest: float = 0.3,
+        rest: float = 0.9,
         coherent_weight: float = 2.0,
         coherent_level: float = 0.6,
         v0_m_s: float = 0.2,

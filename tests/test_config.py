@@ -132,8 +132,9 @@ def test_defaults_in_code_are_those_of_the_files(path: str, section: str | None,
 def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
     values = _written("evaluate.yaml")
     assert from_mapping(EvaluateConfig, values) == EvaluateConfig()
-    # A training clip's length and tags mean nothing to an evaluation, which has its own epcs.
+    # A training clip's length, tags and workers mean nothing to an evaluation, which has its own epcs.
     assert set(values["clips"]) == {field.name for field in dataclasses.fields(config.ClipSettings)} - {
         "length",
         "epcs",
+        "workers",
     }

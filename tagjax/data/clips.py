@@ -18,6 +18,7 @@ from ..rf.reads import PhaseReads
 from ..rf.windows import phase_reads, radio_windows, window_reads
 from ..tracer import Camera, Frame
 from .flow_cache import pair_flow
+from .stream import Stream
 
 Estimator = Literal["robust", "paper"]
 
@@ -170,8 +171,9 @@ _window_jit = jax.jit(window_reads, static_argnums=(2, 3))
 class _ClipSource:
     """Every clip of `length` frames that starts on a multiple of `step`, as Grain's random access source."""
 
-    def __init__(self, recordings: Sequence[Recording], length: int, step: int, **settings):
+    def __init__(self, recordings: Sequence[Recording], length: int, step: int, on_host: bool, **settings):
         self._recordings, self._length, self._settings = list(recordings), length, settings
+        self._on_host = on_host  # NumPy arrays, which one process can hand to another
         self._places = [
             (number, start)
             for number, recording in enumerate(recordings)
@@ -189,7 +191,12 @@ class _ClipSource:
 
     def __getitem__(self, index) -> Clip:
         number, start = self._places[int(index)]
-        return load_clip(self._recordings[number], start, start + self._length, **self._settings)
+        clip = load_clip(self._recordings[number], start, start + self._length, **self._settings)
+        return jax.tree.map(np.asarray, clip) if self._on_host else clip
+
+
+def _on_device(clip: Clip) -> Clip:
+    return jax.tree.map(jnp.asarray, clip)
 
 
 def clip_dataset(
@@ -205,11 +212,14 @@ def clip_dataset(
     estimator: Estimator = "robust",
     antenna: int | None = None,
     step: int | None = None,
-) -> grain.IterDataset:
+    workers: int = 0,
+    share: tuple[int, int] = (0, 1),
+) -> Stream:
     """An endless, shuffled stream of clips; the same seed gives the same order.
 
     Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None).
-    Raises `RecordingError` if no recording is as long as a clip, `ValueError` for settings that no clip can have.
+    With `workers` as many processes load them, radio included, and this one only takes them to its device; `share`
+    (i, n) is every n-th clip from the i-th on. Raises `RecordingError` if no recording is as long as a clip, `ValueError` for settings that no clip can have.
     """
     check_clip(stride=stride, window=window, max_reads=max_reads)
     for name, found in (("clip_length", clip_length), ("step", 1 if step is None else step)):
@@ -219,6 +229,7 @@ def clip_dataset(
         recordings,
         clip_length,
         step or max(1, clip_length // 2),
+        workers > 0,
         stride=stride,
         epcs=epcs,
         flow=flow,
@@ -228,4 +239,4 @@ def clip_dataset(
         antenna=antenna,
     )
     dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()
-    return dataset.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=2))
+    return Stream(dataset, workers=workers, share=share, finish=_on_device if workers else None)

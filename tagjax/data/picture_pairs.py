@@ -25,6 +25,7 @@ from rich.progress import track
 from .._types import LazyArray
 from ..recording import RecordingError
 from .store import open_recording
+from .stream import Stream
 
 VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".webp")
@@ -244,8 +245,13 @@ def pair_dataset(
     settings: VariationSettings,
     *,
     seed: int,
-) -> grain.IterDataset:
-    """An endless, shuffled stream of varied pairs (`vary`), from each source by its share; its iterator resumes exactly."""
+    workers: int = 0,
+    share: tuple[int, int] = (0, 1),
+) -> Stream:
+    """An endless, shuffled stream of varied pairs (`vary`), from each source by its share; its iterator resumes exactly.
+
+    `workers` processes read them; `share` (i, n) is every n-th pair of the stream from the i-th on.
+    """
     if len(sources) != len(shares) or not sources or min(shares) <= 0:
         raise ValueError(f"{len(sources)} sources with shares {list(shares)}; expected a positive share for each.")
     datasets = [
@@ -253,4 +259,4 @@ def pair_dataset(
         for number, source in enumerate(sources)
     ]
     mixed = grain.MapDataset.mix(datasets, weights=list(shares)) if len(datasets) > 1 else datasets[0]
-    return mixed.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=16))
+    return Stream(mixed, workers=workers, ahead=16, share=share)

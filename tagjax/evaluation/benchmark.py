@@ -32,6 +32,7 @@ from ..tagattention import TagAttention
 from ..tracer import trace
 from .flow_speed import flow_timings
 from .timing import Timing, first_call_s, median_ms
+from .training_speed import training_timings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,6 +203,10 @@ def _flow(settings: BenchmarkSettings) -> list[Timing]:
     return flow_timings(settings.height, settings.width, settings.repeats, settings.seed)
 
 
+def _training(settings: BenchmarkSettings) -> list[Timing]:
+    return training_timings(max(2, settings.repeats // 3), settings.seed)
+
+
 CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing]]] = {
     "gather": _gather,
     "splat": _splat,
@@ -212,6 +217,7 @@ CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing]]] = {
     "simulate": _simulate,
     "pairs": _pairs,
     "flow": _flow,
+    "training": _training,
 }
 """What can be measured, by name."""
 

@@ -25,6 +25,7 @@ class ScoreSettings:
 
     moved_for_s: float = 1.5  # score a tag once it has moved for this long
     min_speed_m_s: float = 0.1  # slower than this is no motion
+    frames: tuple[int, int] | None = None  # only these (from, to) are scored; all are traced
     moved_restarts: bool = False  # whether a tag that was out of sight has to move that long again
     border_px: float = 2.0  # an object this near to the edge of the labelled area may be cut off: not scored
     threshold: float = 0.5  # IoU of a lock and of a success
@@ -276,6 +277,9 @@ def _tag_frames(
         min_speed_m_s=settings.min_speed_m_s,
         restarts=settings.moved_restarts,
     )
+    if settings.frames is not None:
+        number = np.arange(len(moved))
+        moved = moved & (number >= settings.frames[0]) & (number < settings.frames[1])
     return FrameScores(
         time_s=time_s[part],
         iou=iou.astype(np.float64),

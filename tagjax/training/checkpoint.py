@@ -1,7 +1,8 @@
 """Checkpoints: everything a run needs to go on exactly where it stopped, written atomically by Orbax.
 
 A checkpoint holds the arrays of the training state (never code or pickles), the state of the data iterator and a
-description of the arrays, which is compared before anything is restored.
+description of the arrays, which is compared before anything is restored. Of several processes only the first touches
+the folder: it needs no file system that all of them share.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
+from .processes import arrays_of_first, is_first, plain_of_first
 from .state import Stepped
 
 StateT = TypeVar("StateT", bound=Stepped)
@@ -40,12 +42,22 @@ class Checkpoints:
     def __init__(self, folder: Path | str, *, keep: int = 3, keep_every: int | None = None, create: bool = True):
         """Raises `CheckpointError` if the folder is missing and is not to be created."""
         self.folder = Path(folder).absolute()
+        self._manager: ocp.CheckpointManager | None = None
+        if not is_first():
+            return
         if not create and not self.folder.is_dir():
             raise CheckpointError(
                 f"No checkpoints at {self.folder}: no such folder. Name a run folder written by experiments.train."
             )
+        self.folder.mkdir(parents=True, exist_ok=True)
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep, keep_period=keep_every, create=create, enable_async_checkpointing=False
+            max_to_keep=keep,
+            keep_period=keep_every,
+            create=False,
+            enable_async_checkpointing=False,
+            multiprocessing_options=ocp.options.MultiprocessingOptions(active_processes={0})
+            if jax.process_count() > 1
+            else ocp.options.MultiprocessingOptions(),
         )
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
@@ -58,16 +70,19 @@ class Checkpoints:
         self.close()
 
     def close(self) -> None:
-        self._manager.close()
+        if self._manager is not None:
+            self._manager.close()
 
     def steps(self) -> list[int]:
-        """Steps at which a finished checkpoint exists, ascending."""
-        return sorted(self._manager.all_steps())
+        """Steps at which a finished checkpoint exists, ascending. To be asked by all processes."""
+        return plain_of_first([] if self._manager is None else sorted(self._manager.all_steps()))
 
     def save(self, state: Stepped, data_state: Any) -> None:
         """Write a checkpoint of the state at its step; `data_state` is plain JSON (the iterator's own state)."""
+        if self._manager is None:
+            return
         step = int(state.step)
-        if step in self.steps():
+        if step in self._manager.all_steps():
             return
         # Flat and named by number: Orbax then needs no knowledge of our classes, and nothing is pickled.
         arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
@@ -85,9 +100,14 @@ class Checkpoints:
         """The state at `step` (the newest if None) and the data iterator's state.
 
         `like` is a fresh state of the same configuration: it gives the structure, the checkpoint the arrays. A folder
-        without checkpoint, a foreign or damaged one, or one of another model raises `CheckpointError`.
+        without checkpoint, a foreign or damaged one, or one of another model raises `CheckpointError`. To be asked by
+        all processes.
         """
-        steps = self.steps()
+        state, data_state = (like, None) if self._manager is None else self._read(self._manager, like, step)
+        return arrays_of_first(state), plain_of_first(data_state)
+
+    def _read(self, manager: ocp.CheckpointManager, like: StateT, step: int | None) -> tuple[StateT, Any]:
+        steps = sorted(manager.all_steps())
         if not steps:
             inside = ", ".join(sorted(path.name for path in self.folder.iterdir())[:6]) or "nothing"
             raise CheckpointError(
@@ -97,20 +117,18 @@ class Checkpoints:
         step = steps[-1] if step is None else step
         if step not in steps:
             raise CheckpointError(f"No checkpoint of step {step} at {self.folder}; there are {steps}.")
-        about = self._about(step)
+        about = self._about(manager, step)
         _compare(about["arrays"], describe_arrays(like), self.folder / str(step))
         arrays, rest = eqx.partition(like, eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
         wanted = {
             f"{n:04d}": jax.ShapeDtypeStruct(
-                leaf.shape, leaf.dtype, sharding=jax.sharding.SingleDeviceSharding(jax.devices()[0])
+                leaf.shape, leaf.dtype, sharding=jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
             )
             for n, leaf in enumerate(leaves)
         }
         try:
-            found = self._manager.restore(step, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(wanted)))[
-                "arrays"
-            ]
+            found = manager.restore(step, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(wanted)))["arrays"]
         except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
             raise CheckpointError(
                 f"The checkpoint {self.folder / str(step)} is damaged: its arrays cannot be read "
@@ -119,10 +137,10 @@ class Checkpoints:
         state = eqx.combine(jax.tree.unflatten(structure, [found[f"{n:04d}"] for n in range(len(leaves))]), rest)
         return state, about["data"]
 
-    def _about(self, step: int) -> dict[str, Any]:
+    def _about(self, manager: ocp.CheckpointManager, step: int) -> dict[str, Any]:
         path = self.folder / str(step)
         try:
-            about = self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
+            about = manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
         except Exception as error:
             inside = ", ".join(sorted(item.name for item in path.iterdir())[:6]) or "nothing"
             raise CheckpointError(

@@ -24,11 +24,12 @@ from ..flow.weights import load_weights, save_weights
 from ..recording import RecordingError
 from ..sim.flow_pairs import FlowPair
 from .checkpoint import Checkpoints
-from .devices import check_batch
+from .devices import check_batch, local
 from .flow_sources import flow_dataset, installed_photographs, validation_pairs
 from .flow_step import FlowTrainState, flow_step
 from .logging import Logger
 from .loop import train
+from .processes import is_first, joined
 from .step import make_optimizer
 
 _PEERS = ("zero", "dis_ultrafast", "dis_fast", "dis")
@@ -47,9 +48,14 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
     """Train as configured and return the mean end-point error on drawn validation pairs, pixels; NaN if interrupted.
 
     `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.npz, which `flow=<path>` uses. An
-    interrupted run goes on from its newest checkpoint when started again in the same folder.
+    interrupted run goes on from its newest checkpoint when started again in the same folder. Of several processes
+    (`config.distributed`) only the first writes.
     """
-    console = console or Console()
+    with joined(config.distributed):
+        return _run(config, folder, console or Console(quiet=not is_first()))
+
+
+def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     begun = time.perf_counter()
     network = make_network(config.flow)
     _check_sizes(network, config.data.variation)
@@ -58,7 +64,8 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
         network = load_weights(network, config.init)
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
     state = FlowTrainState.create(network, optimizer, seed=config.seed)
-    samples = iter(flow_dataset(config.data, seed=config.seed, progress=config.loop.progress))
+    share = jax.process_index(), jax.process_count()
+    samples = iter(flow_dataset(config.data, seed=config.seed, progress=config.loop.progress, share=share))
     held_out = validation_pairs(config.data.drawn)
     peers = {name: scores(flow_of_peer(name, held_out), held_out) for name in _PEERS}
     with Checkpoints(folder / "checkpoints") as checkpoints:
@@ -72,7 +79,8 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
         logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=first_step)
 
         def validate(state: FlowTrainState) -> dict[str, float]:
-            return {f"epe_{name}": value for name, value in scores(flow_of(state.average, held_out), held_out).items()}
+            found = scores(flow_of(local(state.average), held_out), held_out)
+            return {f"epe_{name}": value for name, value in found.items()}
 
         try:
             with jax.default_matmul_precision(config.matmul_precision):
@@ -90,7 +98,9 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
                 )
         finally:
             logger.close()
-    found = {"learned": scores(flow_of(trained.state.average, held_out), held_out), **peers}
+            samples.close()
+    learned = local(trained.state.average)
+    found = {"learned": scores(flow_of(learned, held_out), held_out), **peers}
     steps = int(trained.state.step)
     summary = {
         "steps": steps,
@@ -99,6 +109,8 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
         "elapsed_s_in_this_call": round(time.perf_counter() - begun, 1),
         "machine": machine(),
     }
+    if not is_first():
+        return float("nan") if trained.interrupted else found["learned"]["all"]
     write_json(folder / "metrics.json", summary)
     about = {
         "flow": dict(config.flow),
@@ -106,7 +118,7 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
         "photographs": installed_photographs() if config.data.drawn.photographs else [],
         **summary,
     }
-    save_weights(folder / "weights.npz", trained.state.average, about)
+    save_weights(folder / "weights.npz", learned, about)
     console.print(_table(found))
     if trained.interrupted:
         console.print(f"Stopped at step {steps}; go on with hydra.run.dir={folder}")

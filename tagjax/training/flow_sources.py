@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import cast
 
 import cv2
-import grain
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +22,7 @@ from rich.progress import track
 
 from .._types import LazyArray
 from ..data.picture_pairs import PairSource, StackedPairs, VariationSettings, open_sequence, pair_dataset
+from ..data.stream import Stream
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.textures import PHOTOGRAPHS, photograph
 
@@ -58,6 +58,7 @@ class FlowDataSettings:
     sequences: tuple[str, ...] = ()  # recordings, videos, folders of pictures: never labelled
     sequence_share: float = 0.5  # of the samples, all sequences together; the rest is drawn
     variation: VariationSettings = dataclasses.field(default_factory=VariationSettings)
+    workers: int = 0  # processes that read and vary pairs
 
     def __post_init__(self) -> None:
         if not 0 < self.sequence_share <= 1:
@@ -158,8 +159,10 @@ def validation_pairs(settings: DrawnSettings) -> FlowPair:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
-def flow_dataset(settings: FlowDataSettings, *, seed: int, progress: bool = True) -> grain.IterDataset:
-    """The endless stream of varied pairs that the settings describe."""
+def flow_dataset(
+    settings: FlowDataSettings, *, seed: int, progress: bool = True, share: tuple[int, int] = (0, 1)
+) -> Stream:
+    """The endless stream of varied pairs that the settings describe, or a share of it."""
     sequences = [open_sequence(path, Path(settings.drawn.folder)) for path in settings.sequences]
     lengths = [sequence.shape[0] for sequence in sequences]
     whole = settings.sequence_share if settings.drawn.num_pairs else 1.0
@@ -168,4 +171,4 @@ def flow_dataset(settings: FlowDataSettings, *, seed: int, progress: bool = True
     if (settings.drawn.num_pairs and whole < 1) or not sources:
         sources.append(StackedPairs(drawn_pairs(settings.drawn, progress=progress)))
         shares.append(1 - whole if sequences else 1.0)
-    return pair_dataset(sources, shares, settings.variation, seed=seed)
+    return pair_dataset(sources, shares, settings.variation, seed=seed, workers=settings.workers, share=share)

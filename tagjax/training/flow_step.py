@@ -147,11 +147,11 @@ def flow_step(
 ) -> tuple[FlowTrainState, dict[str, float]]:
     """One update on a batch of `vary`'s pairs. A loss or gradient that is not finite changes nothing but the count.
 
-    All devices of the process share the batch; its size must be a multiple of theirs.
+    All devices share the batch, whose size must be a multiple of theirs; of several processes each gives its share.
     """
     if not samples:
         raise ValueError("A training step needs at least one pair.")
-    check_batch(len(samples))
+    check_batch(len(samples) * jax.process_count())
     clean, seen = (spread(jnp.asarray(np.stack([sample[name] for sample in samples]))) for name in ("clean", "seen"))
     state, numbers = _update((clean, seen), copied(state), optimizer, settings, average_over)
     return state, {name: float(value) for name, value in numbers.items()}

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
+
+from .processes import is_first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,18 +53,42 @@ def _step_of(line: str) -> float:
 
 
 class Logger:
-    """metrics.jsonl, and a Weights & Biases run that never asks for a login."""
+    """metrics.jsonl, and a Weights & Biases run that never asks for a login. Only the first process writes."""
 
     def __init__(
         self, folder: Path, settings: LoggerSettings, *, config: Mapping[str, Any] | None = None, resume_step: int = 0
     ):
-        self._file = MetricsFile(folder / "metrics.jsonl", resume_step=resume_step)
-        self._run = _open_wandb(folder, settings, config or {})
+        self._file, self._run = None, None
+        if is_first():
+            self._file = MetricsFile(folder / "metrics.jsonl", resume_step=resume_step)
+            self._run = _open_wandb(folder, settings, config or {})
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        self._file.write(step, values)
+        if self._file is not None:
+            self._file.write(step, values)
         if self._run is not None:
             self._run.log(dict(values), step=step)
+
+    def report(self, folder: Path, scores: Mapping[str, float], *, tracer: str) -> None:
+        """Final scores, the report's curves, and overlay pictures of one tracer; they lie in `folder` in any case."""
+        if self._run is None:
+            return
+        self._run.summary.update({name: value for name, value in scores.items() if value is not None})
+        if importlib.util.find_spec("PIL") is None:
+            warnings.warn("Pillow is not installed: Weights & Biases gets no pictures.", stacklevel=2)
+            return
+        import wandb
+
+        groups: dict[str, list[Path]] = {"curves": sorted((folder / "curves").glob("*.png"))}
+        for overlays in sorted((folder / "overlays").glob(f"*/{tracer}")):
+            groups[f"overlays/{overlays.parent.name}"] = sorted(overlays.glob("*.png"))
+        pictures = {
+            f"report/{name}": [wandb.Image(str(path), caption=path.stem) for path in paths]
+            for name, paths in groups.items()
+            if paths
+        }
+        if pictures:
+            self._run.log(pictures)
 
     def close(self) -> None:
         if self._run is not None:

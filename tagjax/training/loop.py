@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .checkpoint import Checkpoints
 from .logging import Logger
+from .processes import any_process, is_first, share_of
 from .state import Stepped
 
 StateT = TypeVar("StateT", bound=Stepped)
@@ -35,7 +36,7 @@ class LoopSettings:
     """How long, and how often what is written."""
 
     num_steps: int = 14
-    batch_size: int = 1  # samples whose gradients are averaged in a step
+    batch_size: int = 1  # samples whose gradients are averaged in a step, over all devices and processes
     checkpoint_every: int = 7
     validate_every: int = 7
     log_every: int = 1
@@ -101,8 +102,8 @@ def train(
 ) -> Trained[StateT]:
     """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C ends it.
 
-    `update` does one step on `batch_size` samples and gives numbers to log; `shown` names those beside the progress
-    bar. `validate` gives numbers that are logged under `validation/`; `after_step` is called after every step.
+    `update` does one step on this process's share of `batch_size` samples and gives numbers to log, which are the same
+    in all processes; `shown` names those beside the progress bar. `validate` gives numbers that are logged under `validation/`; `after_step` is called after every step.
 
     A step whose `skipped` is 1 changed nothing. Raises `DivergedError` after `stop_after_skipped` of them in a row; it
     names the last checkpoint written before the first of them.
@@ -116,11 +117,13 @@ def train(
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    done, skipped = int(state.step), 0
-    with _stop_on_interrupt() as stop_asked, Progress(*columns, disable=not settings.progress) as progress:
+    done, skipped, share = int(state.step), 0, share_of(settings.batch_size)
+    quiet = not settings.progress or not is_first()
+    with _stop_on_interrupt() as stop_asked, Progress(*columns, disable=quiet) as progress:
         task = progress.add_task("train", total=settings.num_steps, completed=done, numbers="compiling")
-        while done < settings.num_steps and not stop_asked():
-            state, numbers = update(state, [next(samples) for _ in range(settings.batch_size)])
+        stopping = any_process(stop_asked())
+        while done < settings.num_steps and not stopping:
+            state, numbers = update(state, [next(samples) for _ in range(share)])
             done += 1
             skipped = skipped + 1 if numbers.get("skipped", 0.0) > 0 else 0
             if skipped == settings.stop_after_skipped:
@@ -137,7 +140,8 @@ def train(
                 after_step(state)
             told = "  ".join(f"{name} {numbers[name]:.3f}" for name in shown if name in numbers)
             progress.update(task, completed=done, numbers=told)
-        if stop_asked():
+            stopping = any_process(stop_asked())
+        if stopping:
             jax.block_until_ready(state.step)
             checkpoints.save(state, samples.get_state())
     return Trained(state, done < settings.num_steps)

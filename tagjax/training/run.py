@@ -20,7 +20,8 @@ from ..recording import Recording, RecordingError
 from ..tracer import AbstractTracer
 from .checkpoint import Checkpoints
 from .logging import Logger
-from .loop import train
+from .loop import Trained, train
+from .processes import is_first, joined, share_of
 from .sources import clip_loader, training_recordings
 from .state import TrainState
 from .step import clip_loss, make_optimizer, train_step
@@ -41,12 +42,46 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
 
     That number is the mean box IoU on the held-out recordings if they are labelled, else the coherence of the held-out
     tags' reads with their masks' motion. `folder` then holds checkpoints, metrics.jsonl, metrics.json and report/. An
-    interrupted run leaves a checkpoint, goes on from it when started again in the same folder, and returns NaN.
+    interrupted run leaves a checkpoint, goes on from it when started again in the same folder, and returns NaN. Of
+    several processes (`config.distributed`) the first writes and evaluates; the others return NaN.
     """
     console = console or Console()
-    clips = config.data.clips
-    training, validation = training_recordings(config.data)
-    _describe(console, training, validation)
+    with joined(config.distributed):
+        console.quiet = console.quiet or not is_first()
+        training, validation = training_recordings(config.data)
+        _describe(console, training, validation)
+        trained, logger = _train(config, folder, training, validation, console)
+        first = is_first()
+    try:
+        if not first:
+            return float("nan")
+        if trained.interrupted:
+            console.print(f"Stopped at step {int(trained.state.step)}; go on with hydra.run.dir={folder}")
+            return float("nan")
+        if not validation:
+            console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
+            return float("nan")
+        summary = _report(config, folder, trained.state.tracer, validation)
+        logger.report(folder / "report", summary["learned"]["all"], tracer="learned")
+    finally:
+        logger.close()
+    console.print(score_table(summary, title="held-out recordings"))
+    iou = summary["learned"]["all"].get("iou")
+    if iou is not None:
+        return float(iou)
+    held_out = [clip for recording in validation for clip in validation_clips(recording, config.data.clips)]
+    return held_out_numbers(trained.state, held_out, config)["own_coherence"]
+
+
+def _train(
+    config: TrainConfig,
+    folder: Path,
+    training: Sequence[Recording],
+    validation: Sequence[Recording],
+    console: Console,
+) -> tuple[Trained[TrainState], Logger]:
+    """The trained state, and the logger, which is left open for the report."""
+    clips, batch_size = config.data.clips, config.loop.batch_size
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
     state = TrainState.create(make_tracer(config.tracer), optimizer, seed=config.seed)
     source = iter(
@@ -55,9 +90,17 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
             clip_length=clips.length,
             seed=config.seed,
             epcs=clips.epcs,
+            workers=clips.workers,
+            share=(jax.process_index(), jax.process_count()),
             **clips.arguments(),
         )
     )
+    idle = jax.local_device_count() - share_of(batch_size)
+    if idle > 0:
+        console.print(
+            f"loop.batch_size={batch_size} leaves {idle} of {jax.local_device_count()} devices without a clip."
+        )
+    # Every process looks at all of them: none has to wait for another that does.
     held_out = [clip for recording in validation for clip in validation_clips(recording, clips)]
     with Checkpoints(folder / "checkpoints") as checkpoints:
         if checkpoints.steps():
@@ -81,31 +124,33 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
                 checkpoints=checkpoints,
                 validate=validate if held_out else None,
             )
-        finally:
+        except BaseException:
             logger.close()
-    if trained.interrupted:
-        console.print(f"Stopped at step {int(trained.state.step)}; go on with hydra.run.dir={folder}")
-        return float("nan")
-    if not validation:
-        console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
-        return float("nan")
-    tracers = {"learned": trained.state.tracer, "untrained": make_tracer(config.tracer)}
+            raise
+        finally:
+            source.close()
+    return trained, logger
+
+
+def _report(
+    config: TrainConfig, folder: Path, learned: AbstractTracer, validation: Sequence[Recording]
+) -> dict[str, Any]:
+    """Evaluate the learned tracer beside the untrained one and the baselines; the report's summary."""
+    tracers = {"learned": learned, "untrained": make_tracer(config.tracer)}
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
     write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
     summary = evaluate_tracers(
         tracers,
         validation,
         folder / "report",
-        clips=clips,
+        clips=config.data.clips,
         estimators=config.baseline_estimators,
         settings=config.scores,
-        epcs=clips.epcs,
+        epcs=config.data.clips.epcs,
         progress=config.loop.progress,
     )
     write_json(folder / "metrics.json", summary)
-    console.print(score_table(summary, title="held-out recordings"))
-    iou = summary["learned"]["all"].get("iou")
-    return float(iou) if iou is not None else validate(trained.state)["own_coherence"]
+    return summary
 
 
 def parameters(tracer: AbstractTracer) -> dict[str, float]:

@@ -1,18 +1,28 @@
-"""One training step: gradients of every term through the whole tracer, clipped and guarded, then the update."""
+"""One training step: gradients of every term through the whole tracer, clipped and guarded, then the update.
+
+The gradient is the mean over a step's clips. One device takes them one after the other (gradient accumulation: memory
+is that of one clip); several devices take as many at a time, each a clip of its own; several processes do so each with
+their share and exchange gradients, not clips. Clips that run together have equal shapes, because one compiled program
+runs on all devices; those of other shapes (more tags, another camera) form groups of their own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
-from jaxtyping import Array, Float, PyTree
+from jax.sharding import PartitionSpec
+from jaxtyping import Array, Float, PyTree, UInt32
 
 from ..tracer import AbstractTracer, Camera, Frame
+from .devices import AXIS, copied_here, mesh_here, spread_here
 from .loss import ObjectiveSettings, objective
+from .processes import mean_over_processes
 from .state import TrainState
 
 
@@ -39,6 +49,12 @@ def clip_gradient(
     tracer: AbstractTracer, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
     """Gradient of the weighted objective of one clip, and each term's value and gradient norm."""
+    return _clip_gradient(tracer, camera, frames, key, settings)
+
+
+def _clip_gradient(
+    tracer: AbstractTracer, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
     learnable, rest = eqx.partition(tracer, eqx.is_inexact_array)
     weights = settings.weights()
 
@@ -58,6 +74,60 @@ def clip_gradient(
     total = jax.tree.map(lambda leaf: jnp.tensordot(jnp.asarray(share, leaf.dtype), leaf, axes=1), gradients)
     logged["loss"] = sum((weight * values[name] for name, weight in weights.items()), start=jnp.zeros(()))
     return total, logged
+
+
+@eqx.filter_jit
+def _gradients_side_by_side(
+    tracer: AbstractTracer, camera: Camera, frames: Frame, keys: UInt32[Array, "clip 2"], settings: ObjectiveSettings
+) -> tuple[PyTree, dict[str, Float[Array, " clip"]]]:
+    """`clip_gradient` of stacked clips, one on each device of this process."""
+    arrays, rest = eqx.partition(tracer, eqx.is_array)
+
+    def on_one(arrays: PyTree, camera: Camera, frames: Frame, key: Array) -> Any:
+        # Each device holds one clip: mapped, not vectorised, so that its program is that of a single clip.
+        camera, frames, key = jax.tree.map(lambda leaf: leaf[0], (camera, frames, key))
+        found = _clip_gradient(eqx.combine(arrays, rest), camera, frames, key, settings)
+        return jax.tree.map(lambda leaf: leaf[None], found)
+
+    shared, spread = PartitionSpec(), PartitionSpec(AXIS)
+    run = jax.shard_map(
+        on_one, mesh=mesh_here(), in_specs=(shared, spread, spread, spread), out_specs=spread, check_vma=False
+    )
+    return run(arrays, camera, frames, keys)
+
+
+def _shapes(clip: ClipLike) -> Any:
+    leaves, structure = jax.tree.flatten((clip.camera, clip.frames))
+    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+
+
+def _gradients(
+    tracer: AbstractTracer, clips: Sequence[ClipLike], keys: Sequence[Array], settings: ObjectiveSettings
+) -> Iterator[tuple[PyTree, dict[str, Array]]]:
+    """Gradient and numbers of each clip, in no particular order."""
+    count = jax.local_device_count()
+    if count == 1 or len(clips) == 1:
+        for clip, key in zip(clips, keys, strict=True):
+            yield clip_gradient(tracer, clip.camera, clip.frames, key, settings)
+        return
+    alike: dict[Any, list[int]] = {}
+    for number, clip in enumerate(clips):
+        alike.setdefault(_shapes(clip), []).append(number)
+    everywhere = copied_here(tracer)
+    for numbers in alike.values():
+        for start in range(0, len(numbers), count):
+            chosen = numbers[start : start + count]
+            # Devices for which no clip is left do the last one again, and are not asked.
+            filled = [*chosen, *chosen[-1:] * (count - len(chosen))]
+            together = jax.tree.map(
+                lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
+                *[(clips[number].camera, clips[number].frames, keys[number]) for number in filled],
+            )
+            camera, frames, stacked_keys = spread_here(together)
+            found = _gradients_side_by_side(everywhere, camera, frames, stacked_keys, settings)
+            found = jax.device_put(found, jax.local_devices()[0])
+            for place in range(len(chosen)):
+                yield jax.tree.map(lambda leaf, place=place: leaf[place], found)
 
 
 @eqx.filter_jit
@@ -96,19 +166,21 @@ def train_step(
 ) -> tuple[TrainState, dict[str, float]]:
     """One update from the mean gradient over some clips, which may differ in shape.
 
-    A gradient or loss that is not finite changes nothing but the step count; `skipped` is then 1.
+    All devices share the clips; of several processes each gives its share, as many as the others. A gradient or loss
+    that is not finite changes nothing but the step count; `skipped` is then 1.
     """
     if not clips:
         raise ValueError("A training step needs at least one clip.")
     key = state.step_key()
-    gradients, logs = [], []
-    for number, clip in enumerate(clips):
-        gradient, logged = clip_gradient(
-            state.tracer, clip.camera, clip.frames, jax.random.fold_in(key, number), settings
-        )
-        gradients.append(gradient)
+    # A clip's key is that of its place in the whole batch, whichever process or device it falls to.
+    first, step = jax.process_index(), jax.process_count()
+    keys = [jax.random.fold_in(key, first + step * number) for number in range(len(clips))]
+    total, logs = None, []
+    for gradient, logged in _gradients(state.tracer, clips, keys, settings):
+        total = gradient if total is None else jax.tree.map(jnp.add, total, gradient)
         logs.append(logged)
-    mean: Any = jax.tree.map(lambda *leaves: sum(leaves) / len(leaves), *gradients)
+    mean = jax.tree.map(lambda leaf: leaf / len(clips), total)
     averaged = {name: sum(log[name] for log in logs) / len(logs) for name in logs[0]}
+    mean, averaged = mean_over_processes((mean, averaged))
     state, more = _apply(state, mean, jnp.asarray(averaged["loss"]), optimizer)
     return state, {name: float(value) for name, value in {**averaged, **more}.items()}

@@ -1,0 +1,269 @@
+"""A grid of a tracer's parameters over benchmark suites: IoU against frame number, a table, and the best point.
+
+TagAttention (ToN 2021), Fig. 17 is such a sweep: v0 at 0.01, 0.1 and 0.5 m/s, for a slow and for a fast object. Every
+recording at every point is a line of a file, so that a sweep that was killed goes on where it was.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..config import ClipSettings, ConfigError, build, from_mapping
+from ..data.clips import load_clip
+from ..data.store import open_recording
+from ..sim.suites import SPLITS, Item, Suite, make_suite
+from ..tracer import AbstractTracer
+from ..viz.sweep import curve_panels, parameter_panels
+from .evaluate import RecordingResult, ScoreSettings, evaluate_recording
+from .report import plain
+
+_FEW = 6
+"""Up to so many points have a line each; more are shown by parameter."""
+
+_LINES = "lines.jsonl"
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepConfig:
+    """What is swept over what. `suites` are those of `conf/benchmark`, as their files say."""
+
+    suites: Mapping[str, Mapping[str, Any]]
+    tracer: Mapping[str, Any]
+    grid: Mapping[str, tuple[float, ...]]  # values of the tracer's parameters; all combinations are tried
+    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+    scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
+    out: str = "recordings/benchmark"
+    splits: tuple[str, ...] = ("test",)
+    width: int | None = None  # of the simulated pictures; the suite's own if None
+    most: int | None = None  # recordings of each variant and split; all if None
+    smoke: bool = False
+    workers: int = 1  # processes that simulate what is missing
+
+    def __post_init__(self) -> None:
+        if not self.suites:
+            raise ConfigError("No suite to sweep over: suites=[velocity_threshold], for example.")
+        if unknown := sorted(set(self.splits) - set(SPLITS)):
+            raise ConfigError(f"Unknown splits {', '.join(unknown)}; expected some of {', '.join(SPLITS)}.")
+        if not self.grid or not all(self.grid.values()):
+            raise ConfigError("The grid is empty: 'grid={v0_m_s:[0.01,0.1,0.5]}', for example.")
+        if unknown := sorted(set(self.grid) - set(self.tracer)):
+            known = ", ".join(sorted(set(self.tracer) - {"_target_"}))
+            raise ConfigError(f"grid: the tracer has no {', '.join(unknown)}; it has {known}.")
+
+    def points(self) -> list[dict[str, float]]:
+        """Every combination of the grid's values."""
+        return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """One recording at one point of the grid."""
+
+    key: str  # of everything that the numbers follow from
+    condition: str  # suite and variant
+    recording: str
+    point: Mapping[str, float]
+    numbers: Mapping[str, float | int | None]
+    iou: tuple[float | None, ...]  # by frame, mean over tags that show; no claim counts as 0
+
+
+def run_sweep(
+    config: SweepConfig, folder: Path, *, on_progress: Callable[[int, int, str], None] | None = None
+) -> list[Line]:
+    """The lines of all recordings at all points; `folder` then holds them, table.md, table.csv and sweep.png.
+
+    Lines that the folder holds already are not computed again. `on_progress` is told how many of how many are done,
+    and which is next.
+    """
+    tell = on_progress or (lambda done, total, name: None)
+    folder.mkdir(parents=True, exist_ok=True)
+    work = [
+        (suite, item)
+        for name, values in config.suites.items()
+        for suite in [_suite(config, from_mapping(Suite, values, where=f"benchmark {name}"))]
+        for item in _items(config, suite, lambda made: tell(0, 0, f"simulated {made}"))
+    ]
+    points = config.points()
+    tracers = [_tracer(config, point) for point in points]
+    known = {line.key: line for line in read_lines(folder / _LINES)}
+    lines: list[Line] = []
+    for suite, item in work:
+        keys = [_key(config, suite, item, point) for point in points]
+        if all(key in known for key in keys):
+            lines += [known[key] for key in keys]
+            continue
+        recording = open_recording(item.path(Path(config.out)))
+        load = _remembered(config.clips)
+        for key, point, tracer in zip(keys, points, tracers, strict=True):
+            tell(len(lines), len(work) * len(points), f"{item.name} {said(point)}")
+            if key not in known:
+                settings = dataclasses.replace(config.scores, num_pictures=1)
+                result = evaluate_recording(
+                    tracer, recording, load, stride=config.clips.stride, epcs=config.clips.epcs, settings=settings
+                )
+                known[key] = Line(key, _condition(item), item.name, point, result.scores().result(), frame_iou(result))
+                _append(folder / _LINES, known[key])
+            lines.append(known[key])
+    write_sweep(folder, config, lines)
+    return lines
+
+
+def _suite(config: SweepConfig, suite: Suite) -> Suite:
+    suite = suite.smoke() if config.smoke else suite
+    if config.width is None:
+        return suite
+    return dataclasses.replace(suite, capture=dataclasses.replace(suite.capture, width=config.width))
+
+
+def _items(config: SweepConfig, suite: Suite, tell: Callable[[str], None]) -> list[Item]:
+    def wanted(item: Item) -> bool:
+        return item.split in config.splits and (config.most is None or item.number < config.most)
+
+    make_suite(suite, Path(config.out), workers=config.workers, on_done=lambda made: tell(made.name), wanted=wanted)
+    items = [item for item in suite.items() if wanted(item)]
+    if not items:
+        raise ConfigError(f"{suite.name} has no recording of {', '.join(config.splits)}; choose other splits.")
+    return items
+
+
+def _tracer(config: SweepConfig, point: Mapping[str, float]) -> AbstractTracer:
+    tracer = build({**config.tracer, **point}, where="tracer")
+    if not isinstance(tracer, AbstractTracer):
+        raise ConfigError(f"tracer: {config.tracer['_target_']} is no tracer.")
+    return tracer
+
+
+def _remembered(clips: ClipSettings) -> Callable[..., Any]:
+    """A loader that keeps what it loaded: every point of the grid sees the same pieces."""
+    held: dict[Any, Any] = {}
+
+    def load(recording: Any, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Any:
+        key = (start, stop, None if epcs is None else tuple(epcs))
+        if key not in held:
+            held[key] = load_clip(recording, start, stop, epcs=epcs, **clips.arguments())
+        return held[key]
+
+    return load
+
+
+def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, float]) -> str:
+    scene = {**dataclasses.asdict(suite), "counts": None}  # how many others there are changes nothing
+    parts = [
+        scene,
+        item.name,
+        {**config.tracer, **point},
+        dataclasses.asdict(config.clips),
+        dataclasses.asdict(config.scores),
+    ]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:20]
+
+
+def _condition(item: Item) -> str:
+    return item.suite.name if len(item.suite.variants) == 1 else f"{item.suite.name} {item.variant.name}"
+
+
+def frame_iou(result: RecordingResult) -> tuple[float | None, ...]:
+    """Box IoU of every frame, mean over the tags that show; None where none does."""
+    frames = list(result.frames.values())
+    if not frames:
+        return ()
+    iou = np.stack([np.where(one.found, one.iou, 0.0) for one in frames])
+    shown = np.stack([one.shown for one in frames])
+    count = shown.sum(axis=0)
+    mean = (iou * shown).sum(axis=0) / np.maximum(count, 1)
+    return tuple(round(float(value), 4) if n else None for value, n in zip(mean, count, strict=True))
+
+
+def _append(path: Path, line: Line) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(plain(dataclasses.asdict(line))) + "\n")
+
+
+def read_lines(path: Path) -> list[Line]:
+    """The finished lines of a sweep's file; one that a kill cut short is taken away."""
+    if not path.exists():
+        return []
+    text = path.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        path.write_text(whole, encoding="utf-8")
+    rows = [json.loads(row) for row in whole.splitlines()]
+    return [Line(**{**row, "iou": tuple(row["iou"])}) for row in rows]
+
+
+def said(point: Mapping[str, float]) -> str:
+    """A point of the grid in words."""
+    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+
+
+def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
+    """A row for each point, the best first: mean box IoU over conditions, and IoU and lock of each condition.
+
+    Within a condition every scored frame counts the same; the conditions count the same.
+    """
+    rows: dict[str, dict[str, Any]] = {}
+    groups: dict[tuple[str, str], list[Line]] = {}
+    for line in lines:
+        rows.setdefault(said(line.point), {**line.point})
+        groups.setdefault((said(line.point), line.condition), []).append(line)
+    for (point, condition), ones in groups.items():
+        count = sum(int(one.numbers["num_frames"] or 0) for one in ones)
+        total = sum(float(one.numbers["iou"] or 0.0) * int(one.numbers["num_frames"] or 0) for one in ones)
+        locked = [one.numbers["locked"] for one in ones if one.numbers["locked"] is not None]
+        rows[point][f"{condition}: IoU"] = total / count if count else math.nan
+        rows[point][f"{condition}: locked"] = float(np.mean(locked)) if locked else math.nan
+    for row in rows.values():
+        row["IoU"] = float(np.mean([value for name, value in row.items() if name.endswith(": IoU")]))
+    return sorted(rows.values(), key=lambda row: -row["IoU"])
+
+
+def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> None:
+    """table.csv, table.md and sweep.png."""
+    rows = table(lines)
+    conditions = list(dict.fromkeys(line.condition for line in lines))
+    heads = [*config.grid, "IoU", *(f"{one}: {what}" for one in conditions for what in ("IoU", "locked"))]
+    with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, heads)
+        writer.writeheader()
+        writer.writerows(rows)
+    cells = [[f"{row[head]:.4g}" if head in config.grid else f"{row[head]:.3f}" for head in heads] for row in rows]
+    text = [" | ".join(row) for row in (heads, ["---"] * len(heads), *cells)]
+    (folder / "table.md").write_text("".join(f"| {row} |\n" for row in text), encoding="utf-8")
+    points = config.points()
+    if len(points) <= _FEW:
+        curves = {
+            condition: {
+                said(point): _mean_curve(
+                    [one.iou for one in lines if one.condition == condition and one.point == point]
+                )
+                for point in points
+            }
+            for condition in conditions
+        }
+        curve_panels(folder / "sweep.png", curves)
+    else:
+        best = {
+            name: {value: max(row["IoU"] for row in rows if row[name] == value) for value in values}
+            for name, values in config.grid.items()
+        }
+        parameter_panels(folder / "sweep.png", best)
+
+
+def _mean_curve(ones: Sequence[Sequence[float | None]]) -> np.ndarray:
+    """Mean over recordings by frame; NaN where none shows anything."""
+    length = max((len(one) for one in ones), default=0)
+    padded = np.full((len(ones), length), np.nan)
+    for row, one in zip(padded, ones, strict=True):
+        row[: len(one)] = [np.nan if value is None else value for value in one]
+    count = np.sum(np.isfinite(padded), axis=0)
+    return np.where(count > 0, np.nansum(padded, axis=0) / np.maximum(count, 1), np.nan)

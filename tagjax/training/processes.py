@@ -1,0 +1,123 @@
+"""Processes that train one model together, on one machine or on many, by JAX's own runtime.
+
+Every process runs the same program on its share of each batch; they meet in collectives, so what one of them calls all
+have to call. Process 0 is the one that writes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jaxtyping import PyTree
+
+T = TypeVar("T", bound=PyTree)
+
+
+@dataclasses.dataclass(frozen=True)
+class DistributedSettings:
+    """How the processes find each other. By default there is one."""
+
+    automatic: bool = False  # ask the scheduler, as JAX does: Slurm, Open MPI, Kubernetes
+    coordinator: str | None = None  # host:port at which process 0 listens
+    num_processes: int = 1
+    process_id: int = 0  # counted from 0
+    timeout_s: int = 300  # to wait for the others at the start
+
+    def __post_init__(self) -> None:
+        if self.timeout_s < 1 or self.num_processes < 1:
+            raise ValueError(
+                f"distributed: timeout_s is {self.timeout_s}, num_processes {self.num_processes}; at least 1 is needed."
+            )
+        if not 0 <= self.process_id < self.num_processes:
+            raise ValueError(
+                f"distributed.process_id is {self.process_id}; expected 0 to {self.num_processes - 1} "
+                f"(num_processes is {self.num_processes})."
+            )
+        if self.num_processes > 1 and self.coordinator is None and not self.automatic:
+            raise ValueError(
+                f"distributed.num_processes is {self.num_processes} without a coordinator; give "
+                "distributed.coordinator=<host of process 0>:<port>, or distributed.automatic=true under a scheduler."
+            )
+
+
+@contextmanager
+def joined(settings: DistributedSettings) -> Iterator[None]:
+    """Within it all processes are one machine of many devices. To be entered before anything is computed.
+
+    They part when all have come to the end. An error in one leaves the others without a partner: JAX's runtime ends
+    them, and the run goes on from its newest checkpoint when all are started again.
+    """
+    if not settings.automatic and settings.num_processes == 1:
+        yield
+        return
+    if settings.automatic:
+        jax.distributed.initialize(initialization_timeout=settings.timeout_s)
+    else:
+        jax.distributed.initialize(
+            settings.coordinator,
+            settings.num_processes,
+            settings.process_id,
+            initialization_timeout=settings.timeout_s,
+        )
+    yield
+    jax.distributed.shutdown()
+
+
+def is_first() -> bool:
+    """Whether this is the process that writes."""
+    return jax.process_index() == 0
+
+
+def share_of(batch_size: int) -> int:
+    """How many of a batch's samples each process takes. Raises `ValueError` unless all can take as many."""
+    count = jax.process_count()
+    if batch_size % count:
+        raise ValueError(f"loop.batch_size is {batch_size}; over {count} processes it must be a multiple of {count}.")
+    return batch_size // count
+
+
+def mean_over_processes(tree: T) -> T:
+    """The mean of arrays that every process has its own values of; the same bits everywhere."""
+    if jax.process_count() == 1:
+        return tree
+    arrays, rest = eqx.partition(tree, eqx.is_array)
+    # Gathered and added up in the same order by all: they must not drift apart.
+    gathered = multihost_utils.process_allgather(jax.tree.map(np.asarray, arrays))
+    mean = jax.tree.map(lambda leaf: jax.numpy.asarray(np.mean(leaf, axis=0, dtype=leaf.dtype)), gathered)
+    return eqx.combine(mean, rest)
+
+
+def any_process(flag: bool) -> bool:
+    """Whether any process says so."""
+    if jax.process_count() == 1:
+        return flag
+    return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
+
+
+def arrays_of_first(tree: T) -> T:
+    """The arrays as process 0 has them; shapes and dtypes must be the same everywhere."""
+    if jax.process_count() == 1:
+        return tree
+    arrays, rest = eqx.partition(tree, eqx.is_array)
+    sent = multihost_utils.broadcast_one_to_all(jax.tree.map(np.asarray, arrays))
+    return eqx.combine(jax.tree.map(jax.numpy.asarray, sent), rest)
+
+
+def plain_of_first(content: Any) -> Any:
+    """What process 0 has, of plain JSON."""
+    if jax.process_count() == 1:
+        return content
+    text = np.frombuffer(json.dumps(content).encode(), np.uint8)
+    length = int(multihost_utils.broadcast_one_to_all(np.asarray(text.size, np.int32)))
+    padded = np.zeros(length, np.uint8)
+    if is_first():
+        padded[:] = text
+    return json.loads(np.asarray(multihost_utils.broadcast_one_to_all(padded)).tobytes())

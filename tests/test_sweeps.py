@@ -1,0 +1,285 @@
+"""Sweeps: every launcher and sweeper by its documented command, a killed sweep, grids, and what wandb is given."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import synthetic_clips as synthetic
+
+from tagjax.config import ConfigError
+from tagjax.data.store import save_recording
+from tagjax.evaluation.sweep import Line, SweepConfig, read_lines, run_sweep, said, table, write_sweep
+from tagjax.training.logging import Logger, LoggerSettings
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_once(tmp_path_factory: pytest.TempPathFactory):
+    """Programs that the tests of this file start share what they compile."""
+    settings = {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in settings.items():
+            patch.setenv(name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    folder = tmp_path_factory.mktemp("recordings")
+    paths = []
+    for seed in range(2):
+        paths.append(str(folder / f"scene{seed}.zarr"))
+        save_recording(synthetic.enlarged(synthetic.recording(16, seed=seed, name=f"scene{seed}"), 4), paths[-1])
+    return paths
+
+
+def _environment() -> dict[str, str]:
+    return {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "PYTHONPATH": str(ROOT),  # workers of the launchers start elsewhere
+    }
+
+
+def _run(command: list[str]) -> str:
+    done = subprocess.run(command, cwd=ROOT, env=_environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
+    return done.stdout
+
+
+def _evaluate(recordings: list[str], sweep: Path, *more: str) -> list[str]:
+    return [
+        *(sys.executable, "-m", "experiments.evaluate", "-m", "tracer=tagattention_paper", "progress=false"),
+        *(f"recordings=[{recordings[0]}]", "stride=4", "frames=[0,8]", "tracer.cell=4", "scores.num_pictures=1"),
+        *("tracer.v0_m_s=0.01,0.1", f"hydra.sweep.dir={sweep}", *more),
+    ]
+
+
+def _needs(module: str, extra: str):
+    try:
+        found = importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # no plugin at all
+        found = False
+    return pytest.mark.skipif(not found, reason=f"needs the {extra} extra: pip install -e '.[{extra}]'")
+
+
+LAUNCHERS = [
+    pytest.param([], id="basic"),
+    pytest.param(
+        ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        marks=_needs("hydra_plugins.hydra_joblib_launcher", "sweep"),
+        id="joblib",
+    ),
+    pytest.param(
+        ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=10"],
+        marks=_needs("hydra_plugins.hydra_submitit_launcher", "sweep"),
+        id="submitit",
+    ),
+    pytest.param(
+        ["hydra/launcher=ray", "+hydra.launcher.ray.init.num_cpus=2"],
+        marks=_needs("hydra_plugins.hydra_ray_launcher", "sweep-ray"),
+        id="ray",
+    ),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_every_launcher_runs_a_sweep(recordings: list[str], tmp_path: Path, launcher: list[str]) -> None:
+    _run(_evaluate(recordings, tmp_path, *launcher))
+    for job, v0_m_s in enumerate((0.01, 0.1)):
+        assert "iou" in json.loads((tmp_path / str(job) / "metrics.json").read_text())["untrained"]["all"]
+        assert f"v0_m_s: {v0_m_s}" in (tmp_path / str(job) / "config.yaml").read_text()
+
+
+def _states(storage: Path) -> list[tuple[int, str]]:
+    if not storage.exists():
+        return []
+    try:
+        with sqlite3.connect(f"file:{storage}?mode=ro", uri=True) as base:
+            return base.execute("select number, state from trials order by number").fetchall()
+    except sqlite3.Error:
+        return []  # not yet made
+
+
+@pytest.mark.slow
+@_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
+def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) -> None:
+    storage = tmp_path / "optuna.db"
+    command = [
+        *(sys.executable, "-m", "experiments.train", "-m", "search=optuna", "logger=disabled"),
+        *(f"data.recordings=[{recordings[0]}]", f"data.validation=[{recordings[1]}]", "tracer=tagattention_paper"),
+        *("data.clips.stride=4", "data.clips.length=8", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),
+        *("loop.num_steps=1", "loop.checkpoint_every=1", "loop.validate_every=1", "loop.progress=false"),
+        *("objective.span_frames=4", "objective.skip_frames=3", "objective.max_reads=64", "objective.num_channels=4"),
+        *("scores.num_pictures=1", "scores.moved_for_s=0.3", f"hydra.sweep.dir={tmp_path / 'sweep'}/${{now:%f}}"),
+        *(f"hydra.sweeper.storage=sqlite:///{storage}", "num_trials=4"),
+    ]
+    with subprocess.Popen(command, cwd=ROOT, env=_environment(), stdout=subprocess.DEVNULL) as process:
+        # Killed within the third trial.
+        while [state for _, state in _states(storage)] != ["COMPLETE", "COMPLETE", "RUNNING"]:
+            assert process.poll() is None, "the sweep ended before it could be killed"
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    with sqlite3.connect(storage) as base:
+        kept = base.execute("select trial_id, value from trial_values order by trial_id").fetchall()
+    assert len(kept) == 2
+    _run(command)
+    assert [state for _, state in _states(storage)] == ["COMPLETE", "COMPLETE", "RUNNING", "COMPLETE", "COMPLETE"]
+    with sqlite3.connect(storage) as base:
+        values = base.execute("select trial_id, value from trial_values order by trial_id").fetchall()
+    assert values[:2] == kept
+    _run(command)  # nothing is left to do
+    assert len(_states(storage)) == 5
+
+
+@pytest.mark.filterwarnings("ignore")  # Optuna's and SQLAlchemy's own
+@_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
+def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
+    import optuna
+
+    from experiments.train import trials_left
+
+    storage, folder = f"sqlite:///{tmp_path / 'new' / 'optuna.db'}", tmp_path / "sweep"
+    assert trials_left(3, storage, "one", str(folder)) == 3
+    study = optuna.create_study(study_name="one", storage=storage)
+    study.tell(study.ask(), 0.5)
+    study.tell(study.ask(), state=optuna.trial.TrialState.FAIL)
+    study.ask()  # killed
+    assert trials_left(3, storage, "one", str(folder)) == 2
+    assert trials_left(3, storage, "other", str(folder)) == 3
+    assert not folder.exists()
+    assert trials_left(1, storage, "one", str(folder)) == 0
+    assert folder.is_dir()
+
+
+SUITE = {
+    "name": "tiny",
+    "about": "for a test",
+    "paper": "none",
+    "story": "handheld",
+    "seed": 1,
+    "duration_s": 3.0,
+    "settings": {"still_s": 0.4},
+    "counts": {"train": 0, "validation": 0, "test": 1},
+    "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
+}
+PAPER = {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
+
+
+def _config(folder: Path, **settings) -> SweepConfig:
+    return SweepConfig(
+        **{"suites": {"tiny": SUITE}, "tracer": PAPER, "grid": {"v0_m_s": (0.01, 0.5)}, "out": str(folder), **settings}
+    )
+
+
+@pytest.mark.slow
+def test_a_grid_is_swept_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = _config(tmp_path / "recordings", smoke=True)
+    lines = run_sweep(config, tmp_path / "sweep")
+    assert [line.condition for line in lines] == ["tiny slow"] * 2 + ["tiny fast"] * 2
+    assert [line.point["v0_m_s"] for line in lines] == [0.01, 0.5] * 2
+    kept = (tmp_path / "sweep" / "lines.jsonl").read_text().splitlines()
+    assert len(kept) == 4
+    # Killed within the last line: that one is computed again, the others are not.
+    (tmp_path / "sweep" / "lines.jsonl").write_text("\n".join(kept[:3]) + "\n" + kept[3][:20])
+    told: list[str] = []
+    from tagjax.evaluation import sweep
+
+    asked: list[str] = []
+    evaluate = sweep.evaluate_recording
+    monkeypatch.setattr(sweep, "evaluate_recording", lambda *a, **k: asked.append("") or evaluate(*a, **k))
+    again = run_sweep(config, tmp_path / "sweep", on_progress=lambda done, total, name: told.append(f"{done}/{total}"))
+    assert again == lines
+    assert len(asked) == 1
+    assert told[-1] == "3/4"
+    for name in ("table.md", "table.csv", "sweep.png"):
+        assert (tmp_path / "sweep" / name).stat().st_size > 50
+
+
+def _line(point: dict, condition: str, iou: float, num_frames: int, curve: tuple = (0.0, 1.0)) -> Line:
+    numbers = {"iou": iou, "num_frames": num_frames, "locked": 1.0}
+    return Line(said(point) + condition + str(iou), condition, "one", point, numbers, curve)
+
+
+def test_a_table_weighs_frames_within_and_conditions_alike(tmp_path: Path) -> None:
+    low, high = {"v0_m_s": 0.01}, {"v0_m_s": 0.5}
+    lines = [
+        *(_line(low, "slow", 0.2, 10), _line(low, "slow", 0.8, 30), _line(low, "fast", 0.15, 100)),
+        *(_line(high, "slow", 0.5, 40), _line(high, "fast", 0.9, 1)),
+    ]
+    rows = table(lines)
+    assert [row["v0_m_s"] for row in rows] == [0.5, 0.01]
+    assert rows[1]["slow: IoU"] == pytest.approx(0.65)
+    assert rows[1]["IoU"] == pytest.approx(0.4)
+    write_sweep(tmp_path, _config(tmp_path), lines)
+    with (tmp_path / "table.csv").open() as file:
+        assert [float(row["IoU"]) for row in csv.DictReader(file)] == pytest.approx([0.7, 0.4])
+    assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
+    many = {"v0_m_s": tuple(np.linspace(0, 1, 8).tolist())}
+    write_sweep(tmp_path, _config(tmp_path, grid=many), [_line({"v0_m_s": v}, "a", v, 5) for v in many["v0_m_s"]])
+    assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
+
+
+def test_lines_cut_short_are_taken_away(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    assert read_lines(path) == []
+    whole = '{"key": "a", "condition": "c", "recording": "r", "point": {}, "numbers": {}, "iou": [0.5, null]}\n'
+    path.write_text(whole + whole[:30])
+    (line,) = read_lines(path)
+    assert line.iou == (0.5, None)
+    assert path.read_text() == whole
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"suites": {}}, "No suite"),
+        ({"grid": {}}, "grid is empty"),
+        ({"grid": {"v0_m_s": ()}}, "grid is empty"),
+        ({"grid": {"gamma": (1.0,)}}, "has no gamma; it has alpha_m2, cell, v0_m_s"),
+        ({"splits": ("exam",)}, "Unknown splits exam"),
+    ],
+)
+def test_sweeps_of_nothing_are_refused(tmp_path: Path, settings: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        _config(tmp_path, **settings)
+
+
+def test_wandb_offline_holds_curves_and_overlays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    report = tmp_path / "report"
+    for path in (report / "curves" / "a.png", report / "overlays" / "scene" / "learned" / "frame000003.png"):
+        path.parent.mkdir(parents=True)
+        cv2.imwrite(str(path), np.full((8, 8, 3), 90, np.uint8))
+    logger = Logger(tmp_path, LoggerSettings(mode="offline"), config={"seed": 0})
+    logger.write(1, {"loss": 0.5})
+    logger.report(report, {"iou": 0.25, "cle_px": None}, tracer="learned")
+    logger.close()
+    (run,) = (tmp_path / "wandb").glob("offline-run-*")
+    media = {path.parent.relative_to(run).as_posix() for path in run.rglob("*.png")}
+    assert media == {"files/media/images/report", "files/media/images/report/overlays"}
+    words, stored, waited = (b"loss", b"report/overlays/scene", b"report/curves", b"iou"), b"", 0
+    while not all(word in stored for word in words) and waited < 200:  # a process of its own writes it
+        time.sleep(0.1)
+        stored, waited = next(iter(run.glob("*.wandb"))).read_bytes(), waited + 1
+    assert [word for word in words if word not in stored] == []
+    assert json.loads((tmp_path / "metrics.jsonl").read_text()) == {"step": 1, "loss": 0.5}
