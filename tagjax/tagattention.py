@@ -433,8 +433,11 @@ class TagAttention(AbstractTracer):
 
         refined = refine(pooled[..., 0])
         spread = diffuse(pooled[..., 0], view.affinity, jax.nn.sigmoid(self.logit_diffusion))
-        # What carries the tag moves, so it stands before what has always been there.
-        shown = refine(spread) + near + jnp.exp(self.log_foreground_weight) * view.front
+        held = refine(spread)
+        # What carries the tag moves, so it stands before what has always been there; but where it began it is itself
+        # what is remembered, and evidence outweighs that.
+        front = jnp.where(view.front < 0, view.front * jax.nn.sigmoid(-held), view.front)
+        shown = held + near + jnp.exp(self.log_foreground_weight) * front
         predicted = place.centre_m + place.velocity_m_s * view.elapsed_s * jax.nn.sigmoid(self.logit_inertia)
         mask, centre = self._cut(view, shown, predicted, place)
         told = refined + jax.nn.sigmoid(self.logit_range_share) * near
