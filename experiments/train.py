@@ -32,7 +32,7 @@ def trials_left(wanted: int, storage: str, study: str, folder: str) -> int:
     Only trials that were finished count; one that was killed stays among them as running, and is tried no more.
     `folder` is the sweep's, in which Hydra writes the best trial also where none is left to do.
     """
-    import optuna
+    import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
 
     optuna.logging.set_verbosity(logging.WARNING)
     if storage.startswith("sqlite:///"):

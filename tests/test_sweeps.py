@@ -154,7 +154,7 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
 @pytest.mark.filterwarnings("ignore")  # Optuna's and SQLAlchemy's own
 @_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
 def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
-    import optuna
+    import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
 
     from experiments.train import trials_left
 
