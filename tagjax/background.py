@@ -33,20 +33,27 @@ def _tolerance_m(distance_m: Float[Array, "height width"]) -> Float[Array, "heig
     return 0.05 + _noise_m(distance_m)
 
 
+def _shows(
+    background: Background,
+    distance_m: Float[Array, "height width"],
+    valid: Bool[Array, "height width"],
+    within_m: Float[Array, "height width"],
+) -> Bool[Array, "height width"]:
+    return valid & (background.distance_m > 0) & (jnp.abs(distance_m - background.distance_m) <= within_m)
+
+
 def is_background(
     background: Background, distance_m: Float[Array, "height width"], valid: Bool[Array, "height width"]
 ) -> Bool[Array, "height width"]:
     """Pixels that show the surface remembered for them."""
-    near = jnp.abs(distance_m - background.distance_m) <= _tolerance_m(distance_m)
-    return valid & (background.distance_m > 0) & near
+    return _shows(background, distance_m, valid, _tolerance_m(distance_m))
 
 
 def shows_rest(
     background: Background, distance_m: Float[Array, "height width"], valid: Bool[Array, "height width"]
 ) -> Bool[Array, "height width"]:
     """Pixels whose range is the remembered one to within the sensor's noise."""
-    near = jnp.abs(distance_m - background.distance_m) <= _noise_m(distance_m)
-    return valid & (background.distance_m > 0) & near
+    return _shows(background, distance_m, valid, _noise_m(distance_m))
 
 
 def remember(

@@ -138,17 +138,19 @@ def diffuse(
 
 def segment_affinity(
     segments: Segments,
-    centre_m: Float[Array, "rows columns 3"],
-    step_m: Float[Array, "rows columns"],
-    length_m: Float[Array, ""],
-    step_scale_m: Float[Array, ""],
+    centre: Float[Array, "rows columns 3"],
+    step: Float[Array, "rows columns"],
+    length: Float[Array, ""],
 ) -> Float[Array, "9 rows columns"]:
-    """How much each segment and its eight neighbours are one thing: near in 3D and moving alike; sums to 1."""
+    """How much each segment and its eight neighbours are one thing: near in 3D and moving alike; sums to 1.
+
+    `length` is in the units of `centre`; steps are in units of what still counts as alike.
+    """
     alive = segments.weight > 1.0
-    told = jnp.concatenate([centre_m, step_m[..., None], alive.astype(step_m.dtype)[..., None]], axis=-1)
+    told = jnp.concatenate([centre, step[..., None], alive.astype(step.dtype)[..., None]], axis=-1)
     near = jnp.moveaxis(jnp.stack(_shifted(jnp.moveaxis(told, -1, 0))), 1, -1)
-    apart = jnp.sum(jnp.square(near[..., :3] - centre_m[None]), axis=-1) / (2.0 * length_m**2)
-    unlike = jnp.square(near[..., 3] - step_m[None]) / (2.0 * step_scale_m**2)
+    apart = jnp.sum(jnp.square(near[..., :3] - centre[None]), axis=-1) / (2.0 * length**2)
+    unlike = jnp.square(near[..., 3] - step[None]) / 2.0
     raw = jnp.where((near[..., 4] > 0.5) & alive[None], jnp.exp(-apart - unlike), 0.0)
     return raw / jnp.maximum(jnp.sum(raw, axis=0, keepdims=True), 1e-6)
 

@@ -62,7 +62,6 @@ class _View(eqx.Module):
 
     points_m: Float[Array, "height width 3"]
     distance_m: Float[Array, "height width"]
-    elapsed_s: Float[Array, ""]
     valid: Bool[Array, "height width"]
     front: Float[Array, "height width"]
     time_s: Float[Array, " window"]
@@ -73,6 +72,15 @@ class _View(eqx.Module):
     rho: Float[Array, "height width window"]
     known: Bool[Array, "height width"]
     rho_segment: Float[Array, "rows columns window"]
+
+    @property
+    def elapsed_s(self) -> Float[Array, ""]:
+        return _elapsed_s(self.time_s)
+
+
+def _elapsed_s(time_s: Float[Array, " window"]) -> Float[Array, ""]:
+    """Since the frame before."""
+    return jnp.maximum(time_s[-1] - time_s[-2], 1e-3)
 
 
 def _log(value: float) -> Float[Array, ""]:
@@ -320,14 +328,13 @@ class TagAttention(AbstractTracer):
         valid = frame.depth_m > 0
         distance = jnp.where(valid, safe_norm(points - camera.antenna_m[None, None]), 0.0)
         time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
-        elapsed_s = jnp.maximum(time_s[-1] - time_s[-2], 1e-3)
         # What shows the surface that has always been there has not moved, whatever shadow runs over it.
         rests = shows_rest(state.background, distance, valid)
         backward_px = jnp.where(rests[..., None], 0.0, frame.backward_px)
-        motion = push_gather(state.motion, backward_px, distance, self.max_speed_m_s * elapsed_s + 0.05)
+        motion = push_gather(state.motion, backward_px, distance, self.max_speed_m_s * _elapsed_s(time_s) + 0.05)
         recent = motion.valid[..., -1] & motion.valid[..., -2]
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
-        view = self._view(camera, points, distance, valid, motion, step_m, time_s, elapsed_s, state.background)
+        view = self._view(camera, points, distance, valid, motion, step_m, time_s, state.background)
 
         moved = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), backward_px, jnp.zeros(())), -1, 0)
         # A surface that was hidden a frame ago brings no history of its own, but for what its pixel remembers.
@@ -355,23 +362,19 @@ class TagAttention(AbstractTracer):
         motion: MotionMap,
         step_m: Float[Array, "height width"],
         time_s: Float[Array, " window"],
-        elapsed_s: Float[Array, ""],
         background: Background,
     ) -> _View:
         """Segments, their motion, and what stands in front: once a frame, for all tags."""
-        features = self._features(camera, points_m, valid, step_m, elapsed_s)
+        features = self._features(camera, points_m, valid, step_m, _elapsed_s(time_s))
         segments = segment(features, valid, jnp.exp(self.log_segment_temperature), cell=self.cell)
         rho, known, rho_segment = self._pooled_motion(segments, motion)
         means, mass = pool(
             segments, jnp.concatenate([features, distance_m[..., None]], axis=-1), valid.astype(points_m.dtype)
         )
-        affinity = segment_affinity(
-            segments, means[..., :3], means[..., 3], jnp.exp(self.log_affinity_length), jnp.ones(())
-        )
+        affinity = segment_affinity(segments, means[..., :3], means[..., 3], jnp.exp(self.log_affinity_length))
         return _View(
             points_m=points_m,
             distance_m=distance_m,
-            elapsed_s=elapsed_s,
             valid=valid,
             front=in_front(background, distance_m, valid),
             time_s=time_s,

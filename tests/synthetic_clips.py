@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tagjax._numerics import SPEED_OF_LIGHT_M_S
+from tagjax.data.store import save_recording
 from tagjax.recording import Intrinsics, Recording, TagReads, Truth
 from tagjax.rf.reads import PhaseReads, RadioWindow
 from tagjax.tracer import AbstractTracer, Camera, Frame, Trace
@@ -214,3 +216,11 @@ class ClipCycle:
 
     def set_state(self, state: Any) -> None:
         self._place = int(state["place"])
+
+
+def stored(folder: Path, num_frames: int) -> list[str]:
+    """Paths of two enlarged recordings, written into a folder."""
+    paths = [str(folder / f"scene{seed}.zarr") for seed in range(2)]
+    for seed, path in enumerate(paths):
+        save_recording(enlarged(recording(num_frames, seed=seed, name=f"scene{seed}"), 4), path)
+    return paths

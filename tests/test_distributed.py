@@ -13,14 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
-from test_resume import _kept, _steps_logged, _train, _train_flow, compiled_once
-
-from tagjax.data.store import save_recording
-
-__all__ = ["compiled_once"]  # a fixture
+from test_resume import _kept, _steps_logged, _train, _train_flow
 
 ROOT = Path(__file__).parents[1]
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("compiled_once")]
 
 
 def _free_port() -> int:
@@ -79,12 +75,7 @@ def _alike(one: Path, two: Path) -> None:
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    folder = tmp_path_factory.mktemp("recordings")
-    paths = []
-    for seed in range(2):
-        paths.append(str(folder / f"scene{seed}.zarr"))
-        save_recording(synthetic.enlarged(synthetic.recording(40, seed=seed, name=f"scene{seed}"), 4), paths[-1])
-    return paths
+    return synthetic.stored(tmp_path_factory.mktemp("recordings"), 40)
 
 
 def test_two_processes_learn_tracing_as_one_does(recordings: list[str], tmp_path: Path) -> None:

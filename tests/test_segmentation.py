@@ -114,7 +114,7 @@ def test_diffusion_keeps_constants_and_rests_at_rate_0():
     segments = segment(points, jnp.ones((24, 32), dtype=bool), jnp.asarray(0.05), cell=8)
     centre, _ = pool(segments, points, jnp.ones((24, 32)))
     shape = segments.weight.shape
-    affinity = segment_affinity(segments, centre, jnp.zeros(shape), jnp.asarray(0.3), jnp.asarray(0.1))
+    affinity = segment_affinity(segments, centre, jnp.zeros(shape), jnp.asarray(0.3))
     np.testing.assert_allclose(jnp.sum(affinity, axis=0), 1.0, rtol=1e-4)
     np.testing.assert_allclose(diffuse(jnp.full(shape, 2.0), affinity, jnp.asarray(0.7)), 2.0, rtol=1e-4)
     values = jnp.asarray(np.random.default_rng(0).normal(size=shape).astype(np.float32))
@@ -125,7 +125,7 @@ def test_affinity_is_cut_where_depth_jumps():
     points = _two_planes(24, 32, 16)
     segments = segment(points, jnp.ones((24, 32), dtype=bool), jnp.asarray(1e-2), cell=8)
     centre, _ = pool(segments, points, jnp.ones((24, 32)))
-    affinity = segment_affinity(segments, centre, jnp.zeros(segments.weight.shape), jnp.asarray(0.1), jnp.asarray(0.1))
+    affinity = segment_affinity(segments, centre, jnp.zeros(segments.weight.shape), jnp.asarray(0.1))
     # From the last near column to the first far one: right-hand neighbour, index 5.
     assert float(affinity[5, :, 1].max()) < 1e-6
 

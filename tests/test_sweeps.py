@@ -19,34 +19,16 @@ import pytest
 import synthetic_clips as synthetic
 
 from tagjax.config import ConfigError
-from tagjax.data.store import save_recording
 from tagjax.evaluation.sweep import Line, SweepConfig, read_lines, run_sweep, said, table, write_sweep
 from tagjax.training.logging import Logger, LoggerSettings
 
 ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory: pytest.TempPathFactory):
-    """Programs that the tests of this file start share what they compile."""
-    settings = {
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in settings.items():
-            patch.setenv(name, value)
-        yield
+pytestmark = pytest.mark.usefixtures("compiled_once")
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    folder = tmp_path_factory.mktemp("recordings")
-    paths = []
-    for seed in range(2):
-        paths.append(str(folder / f"scene{seed}.zarr"))
-        save_recording(synthetic.enlarged(synthetic.recording(16, seed=seed, name=f"scene{seed}"), 4), paths[-1])
-    return paths
+    return synthetic.stored(tmp_path_factory.mktemp("recordings"), 16)
 
 
 def _environment() -> dict[str, str]:

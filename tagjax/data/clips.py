@@ -219,7 +219,8 @@ def clip_dataset(
 
     Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None).
     With `workers` as many processes load them, radio included, and this one only takes them to its device; `share`
-    (i, n) is every n-th clip from the i-th on. Raises `RecordingError` if no recording is as long as a clip, `ValueError` for settings that no clip can have.
+    (i, n) is every n-th clip from the i-th on. Raises `RecordingError` if no recording is as long as a clip, `ValueError`
+    for settings that no clip can have.
     """
     check_clip(stride=stride, window=window, max_reads=max_reads)
     for name, found in (("clip_length", clip_length), ("step", 1 if step is None else step)):

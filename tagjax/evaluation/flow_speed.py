@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +16,7 @@ from ..flow.losses import FlowLossSettings
 from ..flow.named import flow_along, make_flow
 from ..flow.pyramid import PyramidFlow
 from ..training.flow_step import FlowTrainState, flow_step
-from .timing import Timing, first_call_s, medians_ms
+from .timing import Timing, first_call_s, in_own_process, medians_ms, peak_memory_mib
 
 _BATCH, _ROWS, _COLUMNS = 8, 128, 160
 """Pairs of a training step, and their size."""
@@ -95,24 +93,15 @@ def flow_memory(height: int, width: int, seed: int) -> dict[str, float]:
     It contains Python and XLA, which compiles; `idle` is the process before either.
     """
     code = f"from tagjax.evaluation.flow_speed import _report_memory; _report_memory({height}, {width}, {seed})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"The process whose memory is measured failed: {done.stderr.strip()[-500:]}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return in_own_process(code, "The process whose memory is measured")
 
 
 def _report_memory(height: int, width: int, seed: int) -> None:
-    import resource  # not on every system
-
-    def peak_mib() -> float:
-        unit = 2**20 if sys.platform == "darwin" else 2**10
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-
     first, second = moved_pictures(height, width, 2, seed)
     jax.block_until_ready(jax.numpy.zeros(()))
-    found = {"idle": peak_mib()}
+    found = {"idle": peak_memory_mib()}
     NetworkFlow(PyramidFlow(seed=seed))(first, second)
-    found["forward"] = peak_mib()
+    found["forward"] = peak_memory_mib()
     _step(seed)()
-    found["step"] = peak_mib()
+    found["step"] = peak_memory_mib()
     print(json.dumps(found))

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ..config import ClipSettings, ConfigError, build, from_mapping
-from ..data.clips import load_clip
+from ..config import ClipSettings, ConfigError, from_mapping
 from ..data.store import open_recording
-from ..sim.suites import SPLITS, Item, Suite, make_suite
-from ..tracer import AbstractTracer
+from ..sim.suites import SPLITS, Item, Suite, make_items
+from ..training.run import make_tracer
+from ..training.sources import clip_loader
 from ..viz.sweep import curve_panels, parameter_panels
 from .evaluate import RecordingResult, ScoreSettings, evaluate_recording
 from .report import plain
@@ -94,7 +94,7 @@ def run_sweep(
         for item in _items(config, suite, lambda made: tell(0, 0, f"simulated {made}"))
     ]
     points = config.points()
-    tracers = [_tracer(config, point) for point in points]
+    tracers = [make_tracer({**config.tracer, **point}) for point in points]
     known = {line.key: line for line in read_lines(folder / _LINES)}
     lines: list[Line] = []
     for suite, item in work:
@@ -126,31 +126,27 @@ def _suite(config: SweepConfig, suite: Suite) -> Suite:
 
 
 def _items(config: SweepConfig, suite: Suite, tell: Callable[[str], None]) -> list[Item]:
-    def wanted(item: Item) -> bool:
-        return item.split in config.splits and (config.most is None or item.number < config.most)
-
-    make_suite(suite, Path(config.out), workers=config.workers, on_done=lambda made: tell(made.name), wanted=wanted)
-    items = [item for item in suite.items() if wanted(item)]
+    items = make_items(
+        suite,
+        Path(config.out),
+        splits=config.splits,
+        most=config.most,
+        workers=config.workers,
+        on_done=lambda made: tell(made.name),
+    )
     if not items:
         raise ConfigError(f"{suite.name} has no recording of {', '.join(config.splits)}; choose other splits.")
     return items
 
 
-def _tracer(config: SweepConfig, point: Mapping[str, float]) -> AbstractTracer:
-    tracer = build({**config.tracer, **point}, where="tracer")
-    if not isinstance(tracer, AbstractTracer):
-        raise ConfigError(f"tracer: {config.tracer['_target_']} is no tracer.")
-    return tracer
-
-
 def _remembered(clips: ClipSettings) -> Callable[..., Any]:
     """A loader that keeps what it loaded: every point of the grid sees the same pieces."""
-    held: dict[Any, Any] = {}
+    load_piece, held = clip_loader(clips), {}
 
     def load(recording: Any, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Any:
         key = (start, stop, None if epcs is None else tuple(epcs))
         if key not in held:
-            held[key] = load_clip(recording, start, stop, epcs=epcs, **clips.arguments())
+            held[key] = load_piece(recording, start, stop, epcs=epcs)
         return held[key]
 
     return load

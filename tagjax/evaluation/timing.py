@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -51,3 +54,22 @@ def first_call_s(function: Callable[[], Any]) -> float:
     start = time.perf_counter()
     jax.block_until_ready(function())
     return time.perf_counter() - start
+
+
+def in_own_process(code: str, what: str) -> dict[str, float]:
+    """What Python code prints as JSON on its last line, run in a fresh process, whose memory is then its own.
+
+    Raises `RuntimeError`, naming `what`, if it fails.
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{what} failed: {done.stderr.strip()[-500:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def peak_memory_mib() -> float:
+    """The largest resident memory of this process so far."""
+    import resource  # not on every system
+
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

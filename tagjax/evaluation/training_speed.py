@@ -7,8 +7,6 @@ and the clip. On the host backend that is all there is; on a GPU it is the host'
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 
 import jax
@@ -22,7 +20,7 @@ from ..tagattention import TagAttention
 from ..training.loss import ObjectiveSettings
 from ..training.state import TrainState
 from ..training.step import make_optimizer, train_step
-from .timing import Timing
+from .timing import Timing, in_own_process, peak_memory_mib
 
 LENGTHS = (12, 24, 48, 96)
 """Frames of a clip."""
@@ -55,17 +53,7 @@ def step_cost(length: int, rematerialise: bool, repeats: int, seed: int) -> dict
         "from tagjax.evaluation.training_speed import _report_step; "
         f"_report_step({length}, {rematerialise}, {repeats}, {seed})"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise RuntimeError(f"A training step of {length} frames failed: {done.stderr[-500:]}")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def _peak_mib() -> float:
-    import resource  # not on every platform
-
-    unit = 1024 if sys.platform != "darwin" else 1024**2
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    return in_own_process(code, f"A training step of {length} frames")
 
 
 def _clip(length: int, seed: int) -> Clip:
@@ -81,14 +69,14 @@ def _report_step(length: int, rematerialise: bool, repeats: int, seed: int) -> N
     state = TrainState.create(TagAttention(), optimizer, seed=seed)
     settings = ObjectiveSettings(rematerialise=rematerialise, skip_frames=min(12, length // 2))
     jax.block_until_ready(clip.frames)
-    found = {"idle_mib": _peak_mib()}
+    found = {"idle_mib": peak_memory_mib()}
     taken = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
         state, _ = train_step(state, [clip], optimizer, settings)  # its numbers are on the host when it returns
         taken.append(time.perf_counter() - start)
     found |= {
-        "memory_mib": _peak_mib(),
+        "memory_mib": peak_memory_mib(),
         "step_ms": 1e3 * float(np.median(taken[1:])),
         "compile_s": taken[0] - float(np.median(taken[1:])),
     }

@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -254,3 +254,21 @@ def make_suite(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return made
+
+
+def make_items(
+    suite: Suite,
+    folder: Path,
+    *,
+    splits: Sequence[str],
+    most: int | None = None,
+    workers: int = 1,
+    on_done: Callable[[Made], None] | None = None,
+) -> list[Item]:
+    """The items of some splits, the first `most` of each variant and split, made where they are missing."""
+
+    def wanted(item: Item) -> bool:
+        return item.split in splits and (most is None or item.number < most)
+
+    make_suite(suite, folder, workers=workers, on_done=on_done, wanted=wanted)
+    return [item for item in suite.items() if wanted(item)]

@@ -103,7 +103,8 @@ def train(
     """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C ends it.
 
     `update` does one step on this process's share of `batch_size` samples and gives numbers to log, which are the same
-    in all processes; `shown` names those beside the progress bar. `validate` gives numbers that are logged under `validation/`; `after_step` is called after every step.
+    in all processes; `shown` names those beside the progress bar. `validate` gives numbers that are logged under
+    `validation/`; `after_step` is called after every step.
 
     A step whose `skipped` is 1 changed nothing. Raises `DivergedError` after `stop_after_skipped` of them in a row; it
     names the last checkpoint written before the first of them.

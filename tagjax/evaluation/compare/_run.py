@@ -15,7 +15,7 @@ from rich.table import Table
 from ...config import ConfigError, from_mapping
 from ...data.store import open_recording
 from ...recording import Recording, RecordingError
-from ...sim.suites import SPLITS, Item, Suite, make_suite
+from ...sim.suites import SPLITS, Item, Suite, make_items
 from ...tracer import Trace
 from ...viz.comparison import bar_plot
 from ..evaluate import RecordingResult, ScoreSettings, score_traces
@@ -86,13 +86,14 @@ def run_comparison(
 def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> list[Item]:
     suite = suite.smoke() if config.smoke else suite
 
-    def wanted(item: Item) -> bool:
-        return item.split == config.split and (config.most is None or item.number < config.most)
-
-    folder = Path(config.out)
-    made = lambda one: tell(f"simulated {one.name}")  # noqa: E731
-    make_suite(suite, folder, workers=config.workers, on_done=made, wanted=wanted)
-    items = [item for item in suite.items() if wanted(item)]
+    items = make_items(
+        suite,
+        Path(config.out),
+        splits=(config.split,),
+        most=config.most,
+        workers=config.workers,
+        on_done=lambda one: tell(f"simulated {one.name}"),
+    )
     if not items:
         raise ConfigError(f"{suite.name} has no {config.split} recording; choose another split, or raise its counts.")
     return items
