@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
@@ -18,11 +19,12 @@ from tagjax.evaluation.evaluate import (
     box_to_picture,
     evaluate_recording,
     mask_to_picture,
+    score_traces,
     trace_recording,
 )
 from tagjax.evaluation.report import plain, score_table, summarise, write_report
 from tagjax.recording import RecordingError
-from tagjax.tracer import trace
+from tagjax.tracer import Trace, trace
 from tagjax.viz.overlay import MIN_WIDTH
 
 EPCS = list(synthetic.EPCS)
@@ -72,6 +74,33 @@ def test_the_object_is_found_named_and_outlined() -> None:
     )
     assert swapped.scores().result()["identification"] == 0.0
     assert swapped.scores().result()["iou"] == 0.0
+
+
+def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
+    recording = synthetic.recording(12)
+    assert recording.truth is not None
+    names = [*EPCS, "on-a-shelf"]
+
+    def said(claimed: bool) -> Trace:
+        return Trace(
+            mask=jnp.zeros((3, synthetic.HEIGHT, synthetic.WIDTH)),
+            box_px=jnp.zeros((3, 4)),
+            centre_px=jnp.zeros((3, 2)),
+            centre_m=jnp.zeros((3, 3)),
+            step_m=jnp.zeros(3),
+            confidence=jnp.ones(3),
+            found=jnp.array([True, False, claimed]),
+        )
+
+    traces = [(number, said(number in (3, 4, 9))) for number in range(12)]
+    result = score_traces(traces, recording, names)
+    scores = result.scores().result()
+    assert scores["false_claims"] == pytest.approx(3 / 12)
+    of_labelled = [tag.result() for tag in result.tag_scores().values()]
+    assert scores["num_frames"] == sum(tag["num_frames"] or 0 for tag in of_labelled)
+    assert all("false_claims" not in tag for tag in of_labelled)
+    blind = dataclasses.replace(recording, truth=None)
+    assert "false_claims" not in score_traces(traces, blind, names).scores().result()
 
 
 def test_without_truth_there_are_pictures_but_no_scores() -> None:

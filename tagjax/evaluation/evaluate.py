@@ -51,12 +51,16 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class RecordingResult:
-    """Scores of every tag of one recording (none without truth), and the pictures kept."""
+    """Scores of every tag of one recording (none without truth), and the pictures kept.
+
+    `no_object` are the tags that no labelled object carries (left lying on a shelf), and when each of them was claimed.
+    """
 
     recording: Recording
     frames: dict[str, FrameScores]
     pictures: list[Picture]
     settings: ScoreSettings
+    no_object: dict[str, Bool[np.ndarray, " time"]] = dataclasses.field(default_factory=dict)
 
     def tag_scores(self) -> dict[str, Scores]:
         """The scores of each tag by itself."""
@@ -71,6 +75,8 @@ class RecordingResult:
         total = Scores()
         for scores in self.tag_scores().values():
             total = total.merge(scores)
+        for found in self.no_object.values():
+            total = total.merge(Scores.of_no_object(found))
         return total
 
 
@@ -200,6 +206,7 @@ def score_traces(
         scored = {}
     kept = set(np.linspace(first, last - 1, settings.num_pictures).astype(int).tolist())
     rows: dict[str, list[tuple[Any, ...]]] = {epc: [] for epc in scored}
+    claims: dict[str, list[bool]] = {epc: [] for epc in names if scored and epc not in scored}
     pictures: list[Picture] = []
     for number, said in traces:
         boxes = box_to_picture(np.asarray(said.box_px), stride, height, width)
@@ -219,6 +226,9 @@ def score_traces(
                             bool(said.found[tag]),
                         )
                     )
+        for tag, epc in enumerate(names):
+            if epc in claims:
+                claims[epc].append(bool(said.found[tag]))
         if number in kept:
             pictures.append(
                 Picture(
@@ -233,7 +243,8 @@ def score_traces(
         if on_frame is not None:
             on_frame()
     results = {epc: _tag_frames(recording, epc, scored[epc], rows[epc], (first, last), settings) for epc in scored}
-    return RecordingResult(recording, results, pictures, settings)
+    no_object = {epc: np.array(found, dtype=bool) for epc, found in claims.items()}
+    return RecordingResult(recording, results, pictures, settings, no_object)
 
 
 def _score_frame(

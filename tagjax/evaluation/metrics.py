@@ -227,6 +227,11 @@ class Scores:
             () if np.isnan(lock) else (lock,),
         )
 
+    @classmethod
+    def of_no_object(cls, found: Bool[np.ndarray, " time"]) -> Scores:
+        """The state of a tag that no labelled object carries: every claim of it is a false one."""
+        return cls({"false_claims": MaskedMean.of(found, np.ones_like(found))})
+
     def merge(self, other: Scores) -> Scores:
         names = {**self.means, **other.means}
         return Scores(
@@ -243,7 +248,8 @@ class Scores:
         for name, mean in self.means.items():
             numbers[name] = mean.result() if mean.count else None
         locked = [lock for lock in self.lock_s if np.isfinite(lock)]
-        numbers["num_frames"] = max((mean.count for mean in self.means.values()), default=0)
+        of_objects = (mean.count for name, mean in self.means.items() if name != "false_claims")
+        numbers["num_frames"] = max(of_objects, default=0)
         numbers["num_tags"] = len(self.lock_s)
         numbers["locked"] = len(locked) / len(self.lock_s) if self.lock_s else None
         numbers["time_to_lock_s"] = float(np.median(locked)) if locked else None

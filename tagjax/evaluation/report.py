@@ -157,6 +157,8 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
         "time_to_lock_s": "lock s",
         "num_frames": "frames",
     }
+    if any(scores["all"].get("false_claims") is not None for scores in summary.values()):
+        columns["false_claims"] = "false"
     table = Table(title=title, box=SIMPLE, pad_edge=False)
     table.add_column("tracer", no_wrap=True)
     for heading in columns.values():
