@@ -34,7 +34,7 @@ class Anchor(eqx.Module):
     @classmethod
     def unknown(cls, num_tags: int, num_window: int, num_bins: int) -> Anchor:
         """Nothing travelled, nothing known."""
-        uniform = -jnp.log(jnp.asarray(num_bins, jnp.float32))
+        uniform = -jnp.log(jnp.asarray(float(num_bins)))
         return cls(jnp.zeros((num_tags, num_window)), jnp.full((num_tags, num_bins), uniform))
 
 

@@ -15,7 +15,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
-from .data.clips import check_clip
+from .data.clips import Estimator, check_clip
 from .evaluation.evaluate import ScoreSettings
 from .flow.losses import FlowLossSettings
 from .training.flow_sources import FlowDataSettings
@@ -41,7 +41,7 @@ class ClipSettings:
     window: int = 5  # frames in a motion vector (k)
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
-    estimator: Literal["robust", "paper"] = "robust"  # of the tags' distances
+    estimator: Estimator = "robust"  # of the tags' distances
     antenna: int | None = None  # that distances are to; the one with the most reads if None
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
@@ -95,16 +95,36 @@ class DataSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class JointSettings:
+    """A flow network that learns with the tracer."""
+
+    flow: Mapping[str, Any]
+    optimizer: Mapping[str, Any]
+    init: str | None = "default"  # weights to begin with: `default` or a file; random ones if None
+    clip_norm: float = 1.0
+    weight: float = 1.0  # of the network's own loss beside the tracer's objective
+    loss: FlowLossSettings = dataclasses.field(default_factory=lambda: FlowLossSettings(occlusion_after=0))
+
+    def __post_init__(self) -> None:
+        if self.weight < 0:
+            raise ConfigError(f"weight is {self.weight}; expected 0 or more.")
+        if self.loss.self_supervision > 0:
+            raise ConfigError("loss.self_supervision is of experiments.train_flow only; expected 0.")
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """Everything of a training run."""
 
     tracer: Mapping[str, Any]
     optimizer: Mapping[str, Any]
+    weights: str | None = None  # learned parameters to begin with: `default`, a name, or a file (tagjax.learned)
     baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside it
     baseline_estimators: Mapping[str, str] = dataclasses.field(default_factory=dict)  # where not the clips' own
     seed: int = 0
     clip_norm: float = 1.0
     resume: bool = True  # go on from the run folder's newest checkpoint, if it holds one
+    joint: JointSettings | None = None  # without it flow is `data.clips.flow`, computed once
     data: DataSettings = dataclasses.field(default_factory=DataSettings)
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
     loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)
@@ -143,6 +163,7 @@ class EvaluateConfig:
     run: str | None = None  # a run folder of experiments.train; without it `tracer` is evaluated untrained
     checkpoint: int | None = None  # step; the newest if None
     tracer: Mapping[str, Any] | None = None
+    weights: str | None = None  # learned parameters of `tracer`: `default`, a name, or a file (tagjax.learned)
     recordings: tuple[str, ...] = ()
     epcs: tuple[str, ...] | None = None
     stride: int | None = None

@@ -12,6 +12,7 @@ the settings at which all of it is gone and the likelihood and the cut are the p
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import equinox as eqx
@@ -305,6 +306,29 @@ class TagAttention(AbstractTracer):
                 else:
                     values[name] = float(leaf)
         return values
+
+    def with_physical(self, values: Mapping[str, float]) -> TagAttention:
+        """The tracer with these parameters, named and in the units of `physical`, in place of its own.
+
+        Raises `ValueError` for names that are missing or unknown, and for values that such a parameter cannot have.
+        """
+        known = self.physical()
+        if set(values) != set(known):
+            lacking, surplus = sorted(set(known) - set(values)), sorted(set(values) - set(known))
+            raise ValueError(f"not this tracer's parameters: missing {lacking}, unknown {surplus}.")
+        leaves: dict[str, Array] = {}
+        for name in vars(self):
+            if name.startswith("log_"):
+                leaves[name] = _log(values[name.removeprefix("log_")])
+            elif name.startswith("logit_"):
+                share = values[name.removeprefix("logit_")]
+                if not 0 <= share <= 1:
+                    raise ValueError(f"{name.removeprefix('logit_')} is {share}; expected a share from 0 to 1.")
+                leaves[name] = _logit(share)
+            elif name in values:
+                leaves[name] = jnp.asarray(values[name], jnp.float32)
+        names = list(leaves)
+        return eqx.tree_at(lambda t: [getattr(t, name) for name in names], self, [leaves[name] for name in names])
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         height, width = frame.depth_m.shape

@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import bounding_box
@@ -35,6 +35,7 @@ class Frame(eqx.Module):
     forward_px: Float[Array, "*time height width 2"]
     radio: RadioWindow  # (*time, tag, window): causal, from reads up to this frame
     reads: PhaseReads  # (*time, tag, read): the reads that fall into this frame's window
+    colour: UInt8[Array, "*time rows columns 3"] | None = None  # the whole picture, where flow is still to be computed
 
 
 class Trace(eqx.Module):

@@ -132,3 +132,20 @@ def test_reads_of_unknown_carrier_do_not_choose_the_antenna(recording: Recording
     unknown = both.with_reads(dataclasses.replace(both.reads, carrier_hz=carrier))
     with pytest.warns(RecordingWarning, match="to antenna 2,"):
         assert choose_antenna(unknown, unknown.reads.epcs) == 2
+
+
+def test_the_true_distances_may_stand_in_for_the_radio(recording: Recording) -> None:
+    clip = load_clip(recording, 3, 12, **SMALL, window=4, estimator="truth")
+    time_s = recording.frame_time_s()
+    for tag, epc in enumerate(clip.epcs):
+        range_m = synthetic.offset_m(synthetic.EPCS[epc], time_s)
+        for index in range(9):
+            past = np.maximum(np.arange(index, index + 4), 0)
+            np.testing.assert_allclose(
+                clip.frames.radio.relative_m[index, tag], range_m[past] - range_m[past[0]], atol=1e-5
+            )
+    assert np.isfinite(np.asarray(clip.frames.radio.std_m)).all()
+    assert recording.truth is not None
+    partly = dataclasses.replace(recording.truth, tag_range_m={"tag-a": recording.truth.tag_range_m["tag-a"]})
+    with pytest.raises(RecordingError, match="true range of tag-b; truth holds that of: tag-a"):
+        load_clip(dataclasses.replace(recording, truth=partly), 3, 12, **SMALL, estimator="truth")

@@ -31,7 +31,7 @@ def _compose(name: str, *overrides: str) -> Any:
         return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
 
 
-GROUPS = ("data", "tracer", "optimizer", "objective", "logger", "experiment", "debug")
+GROUPS = ("data", "tracer", "optimizer", "objective", "joint", "logger", "experiment", "debug")
 
 
 def _options(group: str) -> list[str]:

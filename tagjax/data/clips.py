@@ -14,13 +14,16 @@ import numpy as np
 
 from ..geometry import pixel_rays, range_to_depth
 from ..recording import Recording, RecordingError, RecordingWarning
-from ..rf.reads import PhaseReads
+from ..rf.reads import PhaseReads, RadioWindow
 from ..rf.windows import phase_reads, radio_windows, window_reads
 from ..tracer import Camera, Frame
 from .flow_cache import pair_flow
 from .stream import Stream
 
-Estimator = Literal["robust", "paper"]
+Estimator = Literal["robust", "paper", "truth"]
+"""Of the tags' distances; `truth` takes those of a simulated recording, to tell what the radio costs."""
+
+_TRUTH_STD_M = 1e-3
 
 
 class Clip(eqx.Module):
@@ -107,12 +110,14 @@ def load_clip(
     max_reads: int = 64,
     estimator: Estimator = "robust",
     antenna: int | None = None,
+    colour: bool = False,
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
     `stride` keeps every n-th pixel in both directions. The radio is estimated from the recording's start, causally, so
     that a clip in the middle knows its past. Distances are to one antenna, and the radio uses that antenna's
-    reads only (see `choose_antenna`). Raises `RecordingError` for an unknown EPC or antenna and `ValueError` for frames outside
+    reads only (see `choose_antenna`). With `colour` the clip holds its pictures, and zero in place of the flow, which is
+    then a network's to make. Raises `RecordingError` for an unknown EPC or antenna and `ValueError` for frames outside
     the recording or settings that no clip can have.
     """
     check_clip(stride=stride, window=window, max_reads=max_reads)
@@ -126,16 +131,24 @@ def load_clip(
     depth = recording.depth_metres(slice(start, stop))
     if recording.depth_kind == "range":
         depth = range_to_depth(depth, recording.intrinsics)
-    forward, backward = (
-        ways[:, ::stride, ::stride] / np.float32(stride) for ways in pair_flow(recording, start, stop, flow)
-    )
+    if colour:
+        forward = backward = np.zeros((stop - start, *recording.colour.shape[1:3], 2), np.float32)[
+            :, ::stride, ::stride
+        ]
+    else:
+        forward, backward = (
+            ways[:, ::stride, ::stride] / np.float32(stride) for ways in pair_flow(recording, start, stop, flow)
+        )
     time_s = jnp.asarray(recording.frame_time_s(), jnp.float32)
     heard = recording.reads.antenna == antenna
     longest = max(int(np.sum((recording.reads.epc == epc) & heard)) for epc in named)
     length = max(256, -(-longest // 256) * 256)
     origin_ns = int(recording.time_ns[0])
     buffers = [phase_reads(recording.reads, epc, origin_ns, length=length, antenna=antenna) for epc in named]
-    radio = [radio_windows(reads, time_s, window, estimator) for reads in buffers]
+    if estimator == "truth":
+        radio = [_true_window(recording, epc, window) for epc in named]
+    else:
+        radio = [radio_windows(reads, time_s, window, estimator) for reads in buffers]
     reads = [_window(reads, time_s, window, max_reads) for reads in buffers]
 
     def per_tag(parts):
@@ -153,11 +166,31 @@ def load_clip(
             forward_px=jnp.asarray(forward),
             radio=per_tag(radio),
             reads=per_tag(reads),
+            colour=jnp.asarray(recording.colour[start:stop]) if colour else None,
         ),
         epcs=named,
         name=recording.name,
         start=start,
         stop=stop,
+    )
+
+
+def _true_window(recording: Recording, epc: str, num_window: int) -> RadioWindow:
+    """The true distances to the first antenna, with next to no doubt; unknown ones are infinitely doubtful."""
+    truth = recording.truth
+    if truth is None or epc not in truth.tag_range_m:
+        there = ", ".join(truth.tag_range_m) if truth is not None else ""
+        raise RecordingError(
+            f"{recording.name}: estimator=truth needs the true range of {epc}; truth holds that of: {there or 'no tag'}."
+        )
+    range_m = np.asarray(truth.tag_range_m[epc], np.float64)
+    frame = np.arange(recording.num_frames)
+    past = np.maximum(frame[:, None] + np.arange(1 - num_window, 1)[None], 0)
+    relative = range_m[past] - range_m[past[:, :1]]
+    known = np.isfinite(relative).all(axis=1, keepdims=True) & (frame > 0)[:, None]
+    std = np.where(np.arange(num_window) > 0, _TRUTH_STD_M, 0.0)[None]
+    return RadioWindow(
+        jnp.asarray(np.where(known, relative, 0.0), jnp.float32), jnp.asarray(np.where(known, std, np.inf), jnp.float32)
     )
 
 
@@ -211,6 +244,7 @@ def clip_dataset(
     max_reads: int = 64,
     estimator: Estimator = "robust",
     antenna: int | None = None,
+    colour: bool = False,
     step: int | None = None,
     workers: int = 0,
     share: tuple[int, int] = (0, 1),
@@ -238,6 +272,7 @@ def clip_dataset(
         max_reads=max_reads,
         estimator=estimator,
         antenna=antenna,
+        colour=colour,
     )
     dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()
     return Stream(dataset, workers=workers, share=share, finish=_on_device if workers else None)

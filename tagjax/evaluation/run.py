@@ -7,23 +7,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..config import ConfigError, EvaluateConfig, TrainConfig, build, from_mapping
+from ..config import ConfigError, EvaluateConfig, TrainConfig, from_mapping
 from ..data.store import open_recording
-from ..tracer import AbstractTracer
 from ..training.checkpoint import Checkpoints
-from ..training.run import evaluate_tracers, make_tracer
+from ..training.run import evaluate_tracers, initial_state, make_tracer, own_flow
 from ..training.sources import training_recordings, with_virtual_tags
 from ..training.state import TrainState
-from ..training.step import make_optimizer
 
 
-def restore_tracer(run: Path, config: TrainConfig, *, step: int | None = None) -> AbstractTracer:
-    """The tracer of a run's checkpoint (the newest if `step` is None), built as the run's own configuration says."""
-    optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
-    fresh = TrainState.create(make_tracer(config.tracer), optimizer, seed=config.seed)
+def restore_state(run: Path, config: TrainConfig, *, step: int | None = None) -> TrainState:
+    """The state of a run's checkpoint (the newest if `step` is None), built as the run's own configuration says."""
+    fresh, _ = initial_state(config)
     with Checkpoints(run / "checkpoints", create=False) as checkpoints:
         state, _ = checkpoints.restore(fresh, step)
-    return state.tracer
+    return state
 
 
 def run_evaluation(
@@ -36,18 +33,26 @@ def run_evaluation(
     """
     clips, baselines, recordings = config.clips, dict(config.baselines or {}), []
     estimators = dict(config.baseline_estimators or {})
+    flows: dict[str, str] = {}
     if config.run is not None:
+        if config.weights is not None:
+            raise ConfigError(
+                f"run={config.run} has parameters of its own; weights={config.weights} goes with tracer=."
+            )
         if run_values is None:
             raise ConfigError(f"run={config.run}: its configuration was not given.")
         trained = from_mapping(TrainConfig, run_values)
-        tracers = {"learned": restore_tracer(Path(config.run), trained, step=config.checkpoint)}
+        state = restore_state(Path(config.run), trained, step=config.checkpoint)
+        tracers = {"learned": state.tracer}
+        flows = {"learned": own_flow(state.model, trained, folder / "flow.npz")}
         clips = trained.data.clips
         baselines = dict(trained.baselines) if config.baselines is None else baselines
         estimators = dict(trained.baseline_estimators) | estimators
         if not config.recordings:
             recordings = training_recordings(trained.data)[1]
     elif config.tracer is not None:
-        tracers = {"untrained": make_tracer(config.tracer)}
+        name = "untrained" if config.weights is None else "learned"
+        tracers = {name: make_tracer(config.tracer, config.weights)}
     else:
         raise ConfigError("Nothing to evaluate: give run=<folder of experiments.train>, or tracer=<name> untrained.")
     if config.stride is not None:
@@ -62,6 +67,7 @@ def run_evaluation(
         folder,
         clips=clips,
         estimators=estimators,
+        flows=flows,
         settings=config.scores,
         epcs=config.epcs,
         frames=config.frames,

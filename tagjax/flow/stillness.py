@@ -7,9 +7,13 @@ motion on every slanted floor, which is as much as a tag in a hand moves between
 from __future__ import annotations
 
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
+from ..image.census import to_grey
+from ..image.warp import gather, pixel_grid
 from .pictures import check_pictures
 
 BLOCK_PX = 7
@@ -40,3 +44,27 @@ def settled(
     rest, motion = (cv2.blur(np.square(each - one), (BLOCK_PX, BLOCK_PX)) for each in (other, moved))
     still = rest <= GAIN * motion + _LEAST_VARIANCE
     return np.where(still[..., None], np.float32(0.0), flow)
+
+
+def has_moved(
+    flow_px: Float[Array, "height width 2"],
+    here: Float[Array, "height width 3"],
+    there: Float[Array, "height width 3"],
+) -> Bool[Array, "height width"]:
+    """Where `settled` keeps the flow; as a function of JAX, of pictures from 0 to 1. It carries no gradient."""
+    height, width, _ = flow_px.shape
+    one, other = (255 * to_grey(each) for each in (here, there))
+    corner = jnp.asarray([width - 1, height - 1], flow_px.dtype)
+    grid = jnp.stack(pixel_grid(height, width, flow_px.dtype), axis=-1)
+    # Beyond the edge the edge's pixels go on.
+    within = jnp.clip(grid + flow_px, 0, corner.reshape(1, 1, 2)) - grid
+    moved = gather(other[..., None], within)[0][..., 0]
+    rest, motion = (_block_mean(jnp.square(each - one)) for each in (other, moved))
+    return jax.lax.stop_gradient(rest > GAIN * motion + _LEAST_VARIANCE)
+
+
+def _block_mean(image: Float[Array, "height width"]) -> Float[Array, "height width"]:
+    """Mean over `BLOCK_PX` x `BLOCK_PX` pixels, the picture mirrored at its edges."""
+    padded = jnp.pad(image, BLOCK_PX // 2, mode="reflect")
+    sums = jax.lax.reduce_window(padded, 0.0, jax.lax.add, (BLOCK_PX, BLOCK_PX), (1, 1), "valid")
+    return sums / BLOCK_PX**2

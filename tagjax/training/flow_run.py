@@ -44,6 +44,12 @@ def make_network(settings: Mapping[str, Any]) -> AbstractFlowNetwork:
     return network
 
 
+def initial_network(settings: Mapping[str, Any], init: str | None) -> AbstractFlowNetwork:
+    """The network that the settings name, with the weights to begin with. Errors as of `make_network`, `load_weights`."""
+    network = make_network(settings)
+    return network if init is None else load_weights(network, init)
+
+
 def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console | None = None) -> float:
     """Train as configured and return the mean end-point error on drawn validation pairs, pixels; NaN if interrupted.
 
@@ -57,11 +63,9 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
 
 def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     begun = time.perf_counter()
-    network = make_network(config.flow)
+    network = initial_network(config.flow, config.init)
     _check_sizes(network, config.data.variation)
     check_batch(config.loop.batch_size)
-    if config.init is not None:
-        network = load_weights(network, config.init)
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
     state = FlowTrainState.create(network, optimizer, seed=config.seed)
     share = jax.process_index(), jax.process_count()

@@ -20,7 +20,7 @@ from ..flow.losses import (
     teaching_term,
     weighted,
 )
-from ..flow.network import AbstractFlowNetwork, flow_both_ways
+from ..flow.network import AbstractFlowNetwork, Levels, flow_both_ways
 from .devices import check_batch, copied, spread
 
 
@@ -56,14 +56,8 @@ def pair_terms(
 
     The clean pictures may reach beyond the varied ones, alike at every side.
     """
-    margin, (height, width) = margin_of(seen.shape[1:], clean.shape[1:]), seen.shape[1:3]
-    first, second = (each[margin : margin + height, margin : margin + width] for each in clean)
     forward, backward = flow_both_ways(network, seen[0], seen[1])
-    terms_of = sequence_terms if settings.sequence_decay > 0 else level_terms
-    # Mapped, not written twice: less to compile.
-    ways = [jax.tree.map(lambda *way: jnp.stack(way), *order) for order in ((forward, backward), (backward, forward))]
-    both = jax.vmap(lambda there, back, here, other: terms_of(there, back, here, other, hide, settings))
-    terms = jax.tree.map(jnp.mean, both(ways[0], ways[1], jnp.stack([first, second]), clean[::-1]))
+    terms = terms_both_ways(forward, backward, clean, seen.shape[1:3], hide, settings)
     if not teach:
         return {**terms, "teaching": jnp.zeros(())}
     border = settings.self_supervision_border_px
@@ -74,6 +68,24 @@ def pair_terms(
         for mine, other, whole, whole_other in ((there, back, forward, backward), (back, there, backward, forward))
     ]
     return {**terms, "teaching": (parts[0] + parts[1]) / 2}
+
+
+def terms_both_ways(
+    forward: Levels,
+    backward: Levels,
+    clean: Float[Array, "2 rows columns 3"],
+    size: tuple[int, ...],
+    hide: Float[Array, ""],
+    settings: FlowLossSettings,
+) -> dict[str, Float[Array, ""]]:
+    """Terms of estimates for the middle of two pictures, a part of (height, width) `size`; the mean of both ways."""
+    margin, (height, width) = margin_of(size, clean.shape[1:3]), size
+    middle = clean[:, margin : margin + height, margin : margin + width]
+    terms_of = sequence_terms if settings.sequence_decay > 0 else level_terms
+    # Mapped, not written twice: less to compile.
+    ways = [jax.tree.map(lambda *way: jnp.stack(way), *order) for order in ((forward, backward), (backward, forward))]
+    both = jax.vmap(lambda there, back, here, other: terms_of(there, back, here, other, hide, settings))
+    return jax.tree.map(jnp.mean, both(ways[0], ways[1], middle, clean[::-1]))
 
 
 def batch_loss(

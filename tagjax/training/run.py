@@ -9,32 +9,70 @@ from typing import Any
 
 import jax
 import numpy as np
+import optax
 from rich.console import Console
 from rich.progress import track
 
 from ..config import ClipSettings, TrainConfig, build
 from ..data.clips import Clip, clip_dataset
 from ..evaluation.evaluate import RecordingResult, ScoreSettings, evaluate_recording
-from ..evaluation.report import score_table, write_json, write_report
+from ..evaluation.report import plain, score_table, write_json, write_report
+from ..learned import load_parameters, save_parameters
 from ..recording import Recording, RecordingError
+from ..tagattention import TagAttention
 from ..tracer import AbstractTracer
 from .checkpoint import Checkpoints
+from .flow_run import initial_network
+from .joint import JointModel, save_network
 from .logging import Logger
 from .loop import Trained, train
 from .processes import is_first, joined, share_of
 from .sources import clip_loader, training_recordings
 from .state import TrainState
-from .step import clip_loss, make_optimizer, train_step
+from .step import clip_loss, make_joint_optimizer, make_optimizer, train_step
 
 VALIDATION_CLIPS = 2
 
 
-def make_tracer(settings: Mapping[str, Any]) -> AbstractTracer:
-    """The tracer that the settings name. Raises `ValueError` if they name something else."""
+def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> AbstractTracer:
+    """The tracer that the settings name, with learned parameters if `weights` says which (`load_parameters`).
+
+    Raises `ValueError` if the settings name something else, or a tracer for which there are none.
+    """
     tracer = build(settings, where="tracer")
     if not isinstance(tracer, AbstractTracer):
         raise ValueError(f"tracer: {settings['_target_']} is no tracer; expected a subclass of AbstractTracer.")
-    return tracer
+    if weights is None:
+        return tracer
+    if not isinstance(tracer, TagAttention):
+        raise ValueError(f"weights={weights}: learned parameters are of TagAttention; {settings['_target_']} has none.")
+    return load_parameters(tracer, weights, settings)
+
+
+def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
+    """What a run trains, before its first step: the tracer, with a flow network if `config.joint` asks for one."""
+    tracer = make_tracer(config.tracer, config.weights)
+    if config.joint is None:
+        return tracer
+    network = initial_network(config.joint.flow, config.joint.init)
+    return JointModel(tracer, network, config.joint.weight, config.joint.loss)
+
+
+def initial_state(config: TrainConfig) -> tuple[TrainState, optax.GradientTransformation]:
+    """The state before the first step, and the optimiser."""
+    optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
+    if config.joint is not None:
+        of_network = make_optimizer(build(config.joint.optimizer, where="joint.optimizer"), config.joint.clip_norm)
+        optimizer = make_joint_optimizer(optimizer, of_network)
+    return TrainState.create(make_model(config), optimizer, seed=config.seed), optimizer
+
+
+def own_flow(model: AbstractTracer | JointModel, config: TrainConfig, path: Path) -> str:
+    """The name of the flow that a run's model is evaluated with; a network's weights are written to `path` for it."""
+    if isinstance(model, JointModel) and config.joint is not None:
+        save_network(path, model, config.joint.flow)
+        return str(path)
+    return config.data.clips.flow
 
 
 def run_training(config: TrainConfig, folder: Path, *, console: Console | None = None) -> float:
@@ -61,7 +99,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
         if not validation:
             console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
             return float("nan")
-        summary = _report(config, folder, trained.state.tracer, validation)
+        summary = _report(config, folder, trained.state, validation)
         logger.report(folder / "report", summary["learned"]["all"], tracer="learned")
     finally:
         logger.close()
@@ -69,7 +107,10 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     iou = summary["learned"]["all"].get("iou")
     if iou is not None:
         return float(iou)
-    held_out = [clip for recording in validation for clip in validation_clips(recording, config.data.clips)]
+    joint = config.joint is not None
+    held_out = [
+        clip for recording in validation for clip in validation_clips(recording, config.data.clips, colour=joint)
+    ]
     return held_out_numbers(trained.state, held_out, config)["own_coherence"]
 
 
@@ -82,8 +123,8 @@ def _train(
 ) -> tuple[Trained[TrainState], Logger]:
     """The trained state, and the logger, which is left open for the report."""
     clips, batch_size = config.data.clips, config.loop.batch_size
-    optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
-    state = TrainState.create(make_tracer(config.tracer), optimizer, seed=config.seed)
+    state, optimizer = initial_state(config)
+    joint = config.joint is not None
     source = iter(
         clip_dataset(
             training,
@@ -92,6 +133,7 @@ def _train(
             epcs=clips.epcs,
             workers=clips.workers,
             share=(jax.process_index(), jax.process_count()),
+            colour=joint,
             **clips.arguments(),
         )
     )
@@ -101,7 +143,7 @@ def _train(
             f"loop.batch_size={batch_size} leaves {idle} of {jax.local_device_count()} devices without a clip."
         )
     # Every process looks at all of them: none has to wait for another that does.
-    held_out = [clip for recording in validation for clip in validation_clips(recording, clips)]
+    held_out = [clip for recording in validation for clip in validation_clips(recording, clips, colour=joint)]
     with Checkpoints(folder / "checkpoints") as checkpoints:
         if checkpoints.steps():
             if not config.resume:
@@ -132,12 +174,20 @@ def _train(
     return trained, logger
 
 
-def _report(
-    config: TrainConfig, folder: Path, learned: AbstractTracer, validation: Sequence[Recording]
-) -> dict[str, Any]:
-    """Evaluate the learned tracer beside the untrained one and the baselines; the report's summary."""
-    tracers = {"learned": learned, "untrained": make_tracer(config.tracer)}
+def _report(config: TrainConfig, folder: Path, state: TrainState, validation: Sequence[Recording]) -> dict[str, Any]:
+    """Evaluate the learned tracer beside the untrained one and the baselines; the report's summary.
+
+    Where a flow network was learned with it, each of the two sees with its own, kept as flow.npz and flow_untrained.npz.
+    The learned parameters are kept as weights.json.
+    """
+    models = {"learned": state.model, "untrained": make_model(config)}
+    files = {"learned": folder / "flow.npz", "untrained": folder / "flow_untrained.npz"}
+    flows = {name: own_flow(model, config, files[name]) for name, model in models.items()}
+    tracers = {name: model.tracer if isinstance(model, JointModel) else model for name, model in models.items()}
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
+    if isinstance(tracers["learned"], TagAttention):
+        recipe = dataclasses.asdict(config) | {"steps": int(state.step)}
+        save_parameters(folder / "weights.json", tracers["learned"], config.tracer, plain({"recipe": recipe}))
     write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
     summary = evaluate_tracers(
         tracers,
@@ -145,6 +195,7 @@ def _report(
         folder / "report",
         clips=config.data.clips,
         estimators=config.baseline_estimators,
+        flows=flows,
         settings=config.scores,
         epcs=config.data.clips.epcs,
         progress=config.loop.progress,
@@ -164,15 +215,15 @@ def parameters(tracer: AbstractTracer) -> dict[str, float]:
 def held_out_numbers(state: TrainState, clips: Sequence[Clip], config: TrainConfig) -> dict[str, float]:
     """Mean of every term and diagnostic over held-out clips, always with the same random shifts."""
     key = jax.random.PRNGKey(config.seed)
-    ones = [clip_loss(state.tracer, clip.camera, clip.frames, key, config.objective) for clip in clips]
+    ones = [clip_loss(state.model, clip.camera, clip.frames, key, config.objective) for clip in clips]
     return {name: float(np.mean([float(one[name]) for one in ones])) for name in ones[0]}
 
 
-def validation_clips(recording: Recording, settings: ClipSettings) -> list[Clip]:
-    """A few clips spread over a recording, of the training clips' length (or shorter, if it is)."""
+def validation_clips(recording: Recording, settings: ClipSettings, *, colour: bool = False) -> list[Clip]:
+    """A few clips spread over a recording, of the training clips' length (or shorter); `colour` as of `load_clip`."""
     length = min(settings.length, recording.num_frames)
     starts = np.linspace(0, recording.num_frames - length, VALIDATION_CLIPS).astype(int)
-    load = clip_loader(settings)
+    load = clip_loader(settings, colour=colour)
     return [load(recording, int(start), int(start) + length) for start in sorted(set(starts.tolist()))]
 
 
@@ -183,6 +234,7 @@ def evaluate_tracers(
     *,
     clips: ClipSettings,
     estimators: Mapping[str, str] | None = None,
+    flows: Mapping[str, str] | None = None,
     settings: ScoreSettings,
     epcs: Sequence[str] | None = None,
     frames: tuple[int, int] | None = None,
@@ -190,10 +242,15 @@ def evaluate_tracers(
 ) -> dict[str, Any]:
     """Run each tracer over each recording, write the report into `folder` and return its summary.
 
-    `estimators` names the radio estimator of tracers that do not take the clips' own.
+    `estimators` and `flows` name the radio estimator and the flow of tracers that do not take the clips' own.
     """
+    estimators, flows = estimators or {}, flows or {}
     loaders = {
-        name: clip_loader(dataclasses.replace(clips, estimator=(estimators or {}).get(name, clips.estimator)))
+        name: clip_loader(
+            dataclasses.replace(
+                clips, estimator=estimators.get(name, clips.estimator), flow=flows.get(name, clips.flow)
+            )
+        )
         for name in tracers
     }
     work = [(name, number) for name in tracers for number in range(len(recordings))]

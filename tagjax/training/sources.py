@@ -16,8 +16,8 @@ from ..data.store import open_recording, save_recording
 from ..recording import Recording, RecordingError, TagReads, Truth
 
 
-def clip_loader(settings: ClipSettings) -> Callable[..., Clip]:
-    """`load(recording, start, stop, epcs=...)` with the settings filled in."""
+def clip_loader(settings: ClipSettings, *, colour: bool = False) -> Callable[..., Clip]:
+    """`load(recording, start, stop, epcs=...)` with the settings filled in; `colour` as of `load_clip`."""
 
     def load(recording: Recording, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Clip:
         return load_clip(
@@ -25,6 +25,7 @@ def clip_loader(settings: ClipSettings) -> Callable[..., Clip]:
             start,
             stop,
             epcs=settings.epcs if epcs is None else epcs,
+            colour=colour,
             **settings.arguments(),
         )
 

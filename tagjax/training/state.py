@@ -11,6 +11,7 @@ import optax
 from jaxtyping import Array, Int, PyTree, UInt32
 
 from ..tracer import AbstractTracer
+from .joint import JointModel
 
 
 @runtime_checkable
@@ -22,22 +23,31 @@ class Stepped(Protocol):
 
 
 class TrainState(eqx.Module):
-    """Tracer, optimiser state, number of steps done, and the key from which every step's own key is folded."""
+    """Tracer, optimiser state, number of steps done, and the key from which every step's own key is folded.
 
-    tracer: AbstractTracer
+    `model` is what is learned: the tracer, alone or in a `JointModel`.
+    """
+
+    model: AbstractTracer | JointModel
     optimizer_state: PyTree
     step: Int[Array, ""]
     key: UInt32[Array, " 2"]
 
     @classmethod
-    def create(cls, tracer: AbstractTracer, optimizer: optax.GradientTransformation, *, seed: int) -> TrainState:
-        """The state before the first step. Every inexact array of the tracer is learned."""
-        learnable = eqx.filter(tracer, eqx.is_inexact_array)
+    def create(
+        cls, model: AbstractTracer | JointModel, optimizer: optax.GradientTransformation, *, seed: int
+    ) -> TrainState:
+        """The state before the first step. Every inexact array of the model is learned."""
+        learnable = eqx.filter(model, eqx.is_inexact_array)
         if not jax.tree.leaves(learnable):
             raise ValueError(
-                f"{type(tracer).__name__} holds no learnable array, so there is nothing to train. Evaluate it as it is."
+                f"{type(model).__name__} holds no learnable array, so there is nothing to train. Evaluate it as it is."
             )
-        return cls(tracer, optimizer.init(learnable), jnp.zeros((), jnp.int32), jax.random.PRNGKey(seed))
+        return cls(model, optimizer.init(learnable), jnp.zeros((), jnp.int32), jax.random.PRNGKey(seed))
+
+    @property
+    def tracer(self) -> AbstractTracer:
+        return self.model.tracer if isinstance(self.model, JointModel) else self.model
 
     def step_key(self) -> UInt32[Array, " 2"]:
         """The key of the step about to be done: a function of seed and step only, so that resuming is exact."""

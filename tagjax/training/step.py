@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, PyTree, UInt32
 
 from ..tracer import AbstractTracer, Camera, Frame
 from .devices import AXIS, copied_here, mesh_here, spread_here
+from .joint import Flow, JointModel, network_flow
 from .loss import ObjectiveSettings, objective
 from .processes import mean_over_processes
 from .state import TrainState
@@ -44,24 +45,73 @@ def make_optimizer(inner: optax.GradientTransformation, clip_norm: float) -> opt
     return optax.chain(optax.clip_by_global_norm(clip_norm), inner)
 
 
+Model = AbstractTracer | JointModel
+"""What is trained: a tracer, alone or with the flow network that it sees with."""
+
+
+def make_joint_optimizer(
+    tracer: optax.GradientTransformation, network: optax.GradientTransformation
+) -> optax.GradientTransformation:
+    """One optimiser for the tracer of a `JointModel`, another for its flow network."""
+
+    def labels(learnable: JointModel) -> JointModel:
+        parts = {"tracer": learnable.tracer, "network": learnable.network}
+        told = {name: jax.tree.map(lambda _, name=name: name, part) for name, part in parts.items()}
+        return JointModel(told["tracer"], told["network"], learnable.weight, learnable.loss)
+
+    return optax.partition({"tracer": tracer, "network": network}, labels)
+
+
 @eqx.filter_jit
 def clip_gradient(
-    tracer: AbstractTracer, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
-    """Gradient of the weighted objective of one clip, and each term's value and gradient norm."""
-    return _clip_gradient(tracer, camera, frames, key, settings)
+    """Gradient of the weighted objective of one clip, and each term's value and gradient norm.
+
+    Of a `JointModel` the norm of a term is that of its gradient by the tracer's parameters; a second one is by the flow.
+    """
+    return _clip_gradient(model, camera, frames, key, settings)
 
 
 def _clip_gradient(
-    tracer: AbstractTracer, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
+    if not isinstance(model, JointModel):
+        (gradient, _), logged = _term_gradients(model, None, camera, frames, key, settings)
+        return gradient, logged
+    learnable, rest = eqx.partition(model.network, eqx.is_inexact_array)
+
+    def see(learnable: PyTree) -> tuple[tuple[Flow, Array], dict[str, Array]]:
+        flow, loss, terms = network_flow(eqx.combine(learnable, rest), frames, model.loss)
+        return (flow, loss), terms
+
+    (flow, loss), pull, terms = jax.vjp(see, learnable, has_aux=True)
+    # Each term goes back to the flow by itself, and their sum through the network: once, however many there are.
+    (gradient, by_flow), logged = _term_gradients(model.tracer, flow, camera, frames, key, settings)
+    (by_network,) = pull((by_flow, jnp.asarray(model.weight, loss.dtype)))
+    logged |= {**terms, "flow": loss, "loss": logged["loss"] + model.weight * loss}
+    logged["gradient_norm/network"] = optax.tree.norm(by_network)
+    return JointModel(gradient, by_network, model.weight, model.loss), logged
+
+
+def _term_gradients(
+    tracer: AbstractTracer,
+    flow: Flow | None,
+    camera: Camera,
+    frames: Frame,
+    key: Array,
+    settings: ObjectiveSettings,
+) -> tuple[tuple[PyTree, Flow | None], dict[str, Float[Array, ""]]]:
+    """Gradient of the weighted terms by the tracer and, where it is given, by the flow; and what there is to log."""
     learnable, rest = eqx.partition(tracer, eqx.is_inexact_array)
     weights = settings.weights()
 
-    def terms(learnable: PyTree) -> tuple[dict[str, Array], dict[str, Array]]:
-        return objective(eqx.combine(learnable, rest), camera, frames, key, settings)
+    def terms(inputs: tuple[PyTree, Flow | None]) -> tuple[dict[str, Array], dict[str, Array]]:
+        learnable, flow = inputs
+        seen = frames if flow is None else flow.given_to(frames)
+        return objective(eqx.combine(learnable, rest), camera, seen, key, settings)
 
-    values, pull, diagnostics = jax.vjp(terms, learnable, has_aux=True)
+    values, pull, diagnostics = jax.vjp(terms, (learnable, flow), has_aux=True)
     # One batched pull-back of all terms: compiled once, however many there are.
     names = list(weights)
     chosen = {name: jnp.asarray([float(other == name) for other in names], values[name].dtype) for name in names}
@@ -69,7 +119,10 @@ def _clip_gradient(
     logged = dict(diagnostics)
     for number, name in enumerate(names):
         logged[name] = values[name]
-        logged[f"gradient_norm/{name}"] = optax.tree.norm(jax.tree.map(lambda leaf, n=number: leaf[n], gradients))
+        by_tracer, by_flow = jax.tree.map(lambda leaf, n=number: leaf[n], gradients)
+        logged[f"gradient_norm/{name}"] = optax.tree.norm(by_tracer)
+        if flow is not None:
+            logged[f"gradient_norm/{name}/flow"] = optax.tree.norm(by_flow)
     share = list(weights.values())
     total = jax.tree.map(lambda leaf: jnp.tensordot(jnp.asarray(share, leaf.dtype), leaf, axes=1), gradients)
     logged["loss"] = sum((weight * values[name] for name, weight in weights.items()), start=jnp.zeros(()))
@@ -78,10 +131,10 @@ def _clip_gradient(
 
 @eqx.filter_jit
 def _gradients_side_by_side(
-    tracer: AbstractTracer, camera: Camera, frames: Frame, keys: UInt32[Array, "clip 2"], settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame, keys: UInt32[Array, "clip 2"], settings: ObjectiveSettings
 ) -> tuple[PyTree, dict[str, Float[Array, " clip"]]]:
     """`clip_gradient` of stacked clips, one on each device of this process."""
-    arrays, rest = eqx.partition(tracer, eqx.is_array)
+    arrays, rest = eqx.partition(model, eqx.is_array)
 
     def on_one(arrays: PyTree, camera: Camera, frames: Frame, key: Array) -> Any:
         # Each device holds one clip: mapped, not vectorised, so that its program is that of a single clip.
@@ -102,18 +155,18 @@ def _shapes(clip: ClipLike) -> Any:
 
 
 def _gradients(
-    tracer: AbstractTracer, clips: Sequence[ClipLike], keys: Sequence[Array], settings: ObjectiveSettings
+    model: Model, clips: Sequence[ClipLike], keys: Sequence[Array], settings: ObjectiveSettings
 ) -> Iterator[tuple[PyTree, dict[str, Array]]]:
     """Gradient and numbers of each clip, in no particular order."""
     count = jax.local_device_count()
     if count == 1 or len(clips) == 1:
         for clip, key in zip(clips, keys, strict=True):
-            yield clip_gradient(tracer, clip.camera, clip.frames, key, settings)
+            yield clip_gradient(model, clip.camera, clip.frames, key, settings)
         return
     alike: dict[Any, list[int]] = {}
     for number, clip in enumerate(clips):
         alike.setdefault(_shapes(clip), []).append(number)
-    everywhere = copied_here(tracer)
+    everywhere = copied_here(model)
     for numbers in alike.values():
         for start in range(0, len(numbers), count):
             chosen = numbers[start : start + count]
@@ -132,13 +185,16 @@ def _gradients(
 
 @eqx.filter_jit
 def clip_loss(
-    tracer: AbstractTracer, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> dict[str, Float[Array, ""]]:
     """Terms, diagnostics and the weighted sum of one clip, without gradients."""
-    values, diagnostics = objective(tracer, camera, frames, key, settings)
-    weights = settings.weights()
-    loss = sum((weight * values[name] for name, weight in weights.items()), start=jnp.zeros(()))
-    return {**diagnostics, **values, "loss": loss}
+    found: dict[str, Array] = {"loss": jnp.zeros(())}
+    if isinstance(model, JointModel):
+        flow, own, terms = network_flow(model.network, frames, model.loss)
+        model, frames, found = model.tracer, flow.given_to(frames), {**terms, "flow": own, "loss": model.weight * own}
+    values, diagnostics = objective(model, camera, frames, key, settings)
+    loss = sum((weight * values[name] for name, weight in settings.weights().items()), start=found["loss"])
+    return {**found, **diagnostics, **values, "loss": loss}
 
 
 @eqx.filter_jit
@@ -148,13 +204,13 @@ def _apply(
     norm = optax.tree.norm(gradient)
     usable = jnp.isfinite(norm) & jnp.isfinite(loss)
     safe = jax.tree.map(lambda g: jnp.where(usable, g, jnp.zeros_like(g)), gradient)
-    learnable, rest = eqx.partition(state.tracer, eqx.is_inexact_array)
+    learnable, rest = eqx.partition(state.model, eqx.is_inexact_array)
     with jax.numpy_dtype_promotion("standard"):  # Optax takes powers of its integer step count
         updates, optimizer_state = optimizer.update(safe, state.optimizer_state, learnable)
     keep = lambda new, old: jnp.where(usable, new, old)  # noqa: E731
-    tracer = eqx.combine(jax.tree.map(keep, optax.apply_updates(learnable, updates), learnable), rest)
+    model = eqx.combine(jax.tree.map(keep, optax.apply_updates(learnable, updates), learnable), rest)
     optimizer_state = jax.tree.map(keep, optimizer_state, state.optimizer_state)
-    done = TrainState(tracer, optimizer_state, state.step + 1, state.key)
+    done = TrainState(model, optimizer_state, state.step + 1, state.key)
     return done, {"gradient_norm": norm, "skipped": 1.0 - usable.astype(jnp.float32)}
 
 
@@ -176,7 +232,7 @@ def train_step(
     first, step = jax.process_index(), jax.process_count()
     keys = [jax.random.fold_in(key, first + step * number) for number in range(len(clips))]
     total, logs = None, []
-    for gradient, logged in _gradients(state.tracer, clips, keys, settings):
+    for gradient, logged in _gradients(state.model, clips, keys, settings):
         total = gradient if total is None else jax.tree.map(jnp.add, total, gradient)
         logs.append(logged)
     mean = jax.tree.map(lambda leaf: leaf / len(clips), total)

@@ -1,0 +1,111 @@
+"""Learned tracer parameters as plain numbers: one JSON file with the settings they began from and the recipe.
+
+Nothing in a file is executed: it names numbers, which take the place of parameters that the tracer has already.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .tagattention import TagAttention
+
+PACKAGED = Path(__file__).parent / "tracer_weights"
+"""Where the parameters that come with the package lie, as <name>.json."""
+
+_FORMAT = "tagjax-tracer-parameters"
+_VERSION = 1
+_LONGEST_TEXT = 1_000_000
+
+
+def packaged_parameters() -> tuple[str, ...]:
+    """Names of the parameters that come with the package."""
+    return tuple(sorted(path.stem for path in PACKAGED.glob("*.json")))
+
+
+def save_parameters(
+    path: str | Path, tracer: TagAttention, settings: Mapping[str, Any], about: Mapping[str, Any] | None = None
+) -> None:
+    """Write a tracer's parameters in physical units.
+
+    `settings` are those that the tracer was built with, as under conf/tracer; `about` is the writer's: recipe, seed,
+    data, scores.
+    """
+    path = Path(path)
+    content = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "settings": dict(settings),
+        "parameters": tracer.physical(),
+        "about": dict(about or {}),
+    }
+    beside = path.with_name(path.name + ".part")
+    beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[str, Any]) -> TagAttention:
+    """The tracer with learned parameters in place of its own.
+
+    `source` is a file of `save_parameters`, the name of packaged parameters, or `default`: those that were learned from
+    these very `settings`. Raises `ValueError` where there are none, or for a file that is damaged, foreign, or of
+    another tracer.
+    """
+    path = _default_for(settings) if str(source) == "default" else _find(source)
+    content = _read(path)
+    try:
+        return tracer.with_physical(content["parameters"])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _find(source: str | Path) -> Path:
+    if str(source) in packaged_parameters():
+        return PACKAGED / f"{source}.json"
+    if str(source).endswith(".json") and Path(source).is_file():
+        return Path(source)
+    there = ", ".join(packaged_parameters()) or "none"
+    raise ValueError(
+        f"No learned parameters at {str(source)!r}; expected the path of a .json file (a run folder's weights.json), "
+        f"`default`, or the name of packaged ones ({there})."
+    )
+
+
+def _default_for(settings: Mapping[str, Any]) -> Path:
+    for name in packaged_parameters():
+        path = PACKAGED / f"{name}.json"
+        if _read(path)["settings"] == dict(settings):
+            return path
+    there = ", ".join(packaged_parameters()) or "none"
+    raise ValueError(
+        f"No packaged parameters were learned from these settings of {settings.get('_target_')} (there are: {there}). "
+        "Leave the settings as they come, or give the name or a file."
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _LONGEST_TEXT:
+            raise ValueError(f"{path.stat().st_size} bytes")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: no learned parameters ({type(error).__name__}: {error}).") from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ValueError(f"{path}: JSON, but no learned parameters ({_FORMAT}).")
+    if content.get("version") != _VERSION:
+        raise ValueError(f"{path}: version {content.get('version')!r}; this release reads {_VERSION}. Train again.")
+    numbers = content.get("parameters")
+    if not isinstance(numbers, dict) or not isinstance(content.get("settings"), dict):
+        raise ValueError(f"{path}: holds no parameters or no settings. Copy the file again.")
+    wrong = [name for name, value in numbers.items() if not _is_number(value)]
+    if wrong:
+        raise ValueError(f"{path}: {', '.join(wrong)}: not a finite number. Train again.")
+    return content
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

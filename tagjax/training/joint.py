@@ -1,0 +1,95 @@
+"""Tracer and flow network learned together: the flow is computed inside the objective, so that tags teach it, too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, UInt8
+
+from ..flow.estimate import padding
+from ..flow.losses import FlowLossSettings, weighted
+from ..flow.network import AbstractFlowNetwork, flow_both_ways
+from ..flow.stillness import has_moved
+from ..flow.weights import save_weights
+from ..tracer import AbstractTracer, Frame
+from .flow_step import terms_both_ways
+
+
+class Flow(eqx.Module):
+    """The flow of a clip, as `Frame` holds it."""
+
+    forward_px: Float[Array, "time height width 2"]
+    backward_px: Float[Array, "time height width 2"]
+
+    def given_to(self, frames: Frame) -> Frame:
+        """The clip with this flow in place of its own."""
+        return eqx.tree_at(lambda f: (f.forward_px, f.backward_px), frames, (self.forward_px, self.backward_px))
+
+
+class JointModel(eqx.Module):
+    """A tracer, the flow network that it sees with, and how much that network's own loss weighs beside the reads."""
+
+    tracer: AbstractTracer
+    network: AbstractFlowNetwork
+    weight: float = eqx.field(static=True)
+    loss: FlowLossSettings = eqx.field(static=True)
+
+
+def network_flow(
+    network: AbstractFlowNetwork, frames: Frame, settings: FlowLossSettings
+) -> tuple[Flow, Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """The flow of a clip's pictures at its working resolution, and the network's loss on them with its terms.
+
+    As in the cache, flow that explains no more than rest is zero (`has_moved`); the loss is of the flow before that, on
+    the whole pictures, which repeat their edges where the network asks for other sizes.
+    """
+    if frames.colour is None:
+        raise ValueError("The clip holds no pictures; load it with colour=True to compute flow from them.")
+    stride = _stride(frames)
+
+    @eqx.filter_checkpoint
+    def pair(network: AbstractFlowNetwork, one: UInt8[Array, "_ _ 3"], other: UInt8[Array, "_ _ 3"]):
+        height, width, _ = one.shape
+        sides = [padding(size, network.divisor) for size in (height, width)]
+        dtype = frames.depth_m.dtype
+        pictures = jnp.stack(
+            [jnp.pad(each, (*sides, (0, 0)), mode="edge").astype(dtype) / 255 for each in (one, other)]
+        )
+        forward, backward = flow_both_ways(network, pictures[0], pictures[1])
+        terms = terms_both_ways(forward, backward, pictures, pictures.shape[1:3], jnp.ones((), dtype), settings)
+        place = tuple(slice(before, before + size) for (before, _), size in zip(sides, (height, width), strict=True))
+
+        def working(flow: Array, here: Array, there: Array) -> Array:
+            moved = has_moved(flow, here, there)[..., None]
+            return jnp.where(moved, flow, 0.0)[place][::stride, ::stride] / stride
+
+        ways = working(forward[-1], *pictures), working(backward[-1], *pictures[::-1])
+        return ways, terms
+
+    (forward, backward), terms = jax.lax.map(
+        lambda pictures: pair(network, *pictures), (frames.colour[:-1], frames.colour[1:])
+    )
+    first = jnp.zeros_like(forward[:1])
+    terms = jax.tree.map(jnp.mean, terms)
+    flow = Flow(*(jnp.concatenate([first, way]) for way in (forward, backward)))
+    return flow, weighted(terms, settings), {f"flow/{name}": value for name, value in terms.items()}
+
+
+def _stride(frames: Frame) -> int:
+    """Every how many-th pixel of the pictures the working resolution keeps."""
+    assert frames.colour is not None
+    (height, width), (rows, columns) = frames.colour.shape[1:3], frames.depth_m.shape[1:3]
+    stride = -(-height // rows)
+    if (-(-height // stride), -(-width // stride)) != (rows, columns):
+        raise ValueError(f"Pictures of {height}x{width} pixels do not thin out to depth of {rows}x{columns}.")
+    return stride
+
+
+def save_network(path: Path, model: JointModel, settings: Mapping[str, Any]) -> None:
+    """Write the model's flow network, which `settings` build, as weights that flows are named by (`make_flow`)."""
+    save_weights(path, model.network, {"flow": dict(settings), "learned_with": type(model.tracer).__name__})

@@ -1,0 +1,107 @@
+"""Learned parameters as files: the same tracer comes back, and what does not fit is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from tagjax import learned
+from tagjax.learned import load_parameters, packaged_parameters, save_parameters
+from tagjax.tagattention import TagAttention
+from tagjax.training.run import make_tracer
+
+SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+
+
+def _stirred(seed: int = 0) -> TagAttention:
+    rng = np.random.default_rng(seed)
+    stir = lambda leaf: leaf + jnp.asarray(rng.normal() * 0.2, leaf.dtype) if eqx.is_inexact_array(leaf) else leaf  # noqa: E731
+    return jax.tree.map(stir, TagAttention(cell=4))
+
+
+def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+    stirred = _stirred()
+    save_parameters(tmp_path / "weights.json", stirred, SETTINGS, {"seed": 3})
+    back = make_tracer(SETTINGS, str(tmp_path / "weights.json"))
+    assert isinstance(back, TagAttention)
+    assert jax.tree.structure(back) == jax.tree.structure(stirred)
+    assert back.physical() == pytest.approx(stirred.physical(), rel=1e-5)
+    fresh = TagAttention(cell=4)
+    assert any(float(a) != float(b) for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(fresh), strict=True))
+
+
+def test_default_is_what_was_learned_from_these_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learned, "PACKAGED", tmp_path)
+    save_parameters(tmp_path / "one.json", _stirred(1), SETTINGS)
+    save_parameters(tmp_path / "two.json", _stirred(2), {**SETTINGS, "beta": 0.5})
+    assert packaged_parameters() == ("one", "two")
+    tracer = TagAttention(cell=4)
+    for name, settings in (("one", SETTINGS), ("two", {**SETTINGS, "beta": 0.5})):
+        chosen, named = (load_parameters(tracer, source, settings) for source in ("default", name))
+        assert chosen.physical() == named.physical()
+    with pytest.raises(ValueError, match=r"No packaged parameters were learned from these settings.*one, two"):
+        load_parameters(tracer, "default", {**SETTINGS, "cell": 9})
+
+
+def _changed(path: Path, **changes: Any) -> Path:
+    content = json.loads(path.read_text())
+    content.update(changes)
+    other = path.with_name("changed.json")
+    other.write_text(json.dumps(content))
+    return other
+
+
+def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    tracer = TagAttention(cell=4)
+    path = tmp_path / "weights.json"
+    save_parameters(path, tracer, SETTINGS)
+    good = tracer.physical()
+
+    def load(**changes: Any) -> None:
+        load_parameters(tracer, _changed(path, **changes), SETTINGS)
+
+    with pytest.raises(ValueError, match="no learned parameters"):
+        load(format="another")
+    with pytest.raises(ValueError, match="version 7; this release reads 1"):
+        load(version=7)
+    with pytest.raises(ValueError, match="beta: not a finite number"):
+        load(parameters={**good, "beta": None})
+    with pytest.raises(ValueError, match="alpha: not a finite number"):
+        load(parameters={**good, "alpha": float("nan")})
+    with pytest.raises(ValueError, match=r"missing \['beta'\], unknown \['gamma'\]"):
+        load(parameters={**{name: value for name, value in good.items() if name != "beta"}, "gamma": 1.0})
+    with pytest.raises(ValueError, match=r"beta is 1\.5; expected a share from 0 to 1"):
+        load(parameters={**good, "beta": 1.5})
+    with pytest.raises(ValueError, match="positive value"):
+        load(parameters={**good, "alpha": -1.0})
+    path.write_text(path.read_text()[:40])
+    with pytest.raises(ValueError, match="no learned parameters"):
+        load_parameters(tracer, path, SETTINGS)
+    with pytest.raises(ValueError, match="No learned parameters at 'nowhere'"):
+        load_parameters(tracer, "nowhere", SETTINGS)
+
+
+def test_a_tracer_without_learned_parameters_says_so() -> None:
+    with pytest.raises(ValueError, match="learned parameters are of TagAttention"):
+        make_tracer({"_target_": "tagjax.tagattention_paper.TagAttentionPaper"}, "default")
+
+
+@pytest.mark.parametrize("name", packaged_parameters())
+def test_packaged_parameters_are_the_default_of_their_configuration(name: str) -> None:
+    with initialize_config_dir(str((Path(__file__).parents[1] / "conf").resolve()), version_base="1.3"):
+        composed = OmegaConf.to_container(compose("train", [f"tracer={name}"]), resolve=True)
+    assert isinstance(composed, dict)
+    tracer = make_tracer(composed["tracer"], "default")
+    untrained = make_tracer(composed["tracer"])
+    assert isinstance(tracer, TagAttention)
+    assert isinstance(untrained, TagAttention)
+    assert tracer.physical() != untrained.physical()
