@@ -154,3 +154,23 @@ def test_merging_scores_equals_scoring_together() -> None:
     assert result["num_tags"] == 2
     assert result["locked"] == 0.0
     assert result["time_to_lock_s"] is None
+
+
+def test_recovery_counts_from_each_time_the_object_shows_again():
+    shown = np.array([1, 1, 1, 0, 0, 0, 1, 1, 1, 1, 0, 1, 0, 0, 0, 0, 1, 1, 1, 0, 0, 0, 1], bool)
+    iou = np.zeros(len(shown))
+    iou[:3] = 0.9
+    iou[8:12] = 0.7  # locked at the third frame of the second appearance, over a gap too short to count
+    iou[17] = 0.9  # one good frame is no lock
+    time_s = 0.1 * np.arange(len(shown))
+    found = metrics.times_to_recover(iou, shown, time_s, num_frames=2)
+    assert found == pytest.approx((0.2, np.inf))  # the last appearance is too short to lock
+    assert metrics.times_to_recover(iou[:5], shown[:5], time_s[:5], num_frames=2) == ()
+    frames = metrics.FrameScores(
+        time_s, iou, iou, iou, np.ones(len(iou), int), iou, iou > 0, shown, np.ones(len(iou), bool), 1
+    )
+    scores = metrics.Scores.of(frames, lock_frames=2)
+    numbers = scores.merge(scores).result()
+    assert numbers["recovered"] == 0.5
+    assert numbers["time_to_recover_s"] == pytest.approx(0.2)
+    assert "recovered" not in metrics.Scores().result()

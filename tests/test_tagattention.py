@@ -233,4 +233,6 @@ def test_gathering_does_not_cross_a_depth_edge():
 
 def test_only_frames_and_reads_enter(clip):
     """A tracer's input holds no labels: what it says cannot depend on truth. (`colour` is for flow networks that learn.)"""
-    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour"} == set(Frame.__dataclass_fields__)
+    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour"} == set(
+        Frame.__dataclass_fields__
+    )

@@ -124,6 +124,36 @@ def time_to_lock(
     return float("inf")
 
 
+def times_to_recover(
+    iou: Float[np.ndarray, " time"],
+    shown: Bool[np.ndarray, " time"],
+    time_s: Float[np.ndarray, " time"],
+    *,
+    threshold: float = 0.5,
+    num_frames: int = 5,
+    hidden_frames: int = 3,
+) -> tuple[float, ...]:
+    """Seconds to lock anew, once for every time that the object shows again after `hidden_frames` or more.
+
+    Counts as `time_to_lock` from the first frame that shows it to the next such disappearance; infinite where it is not
+    locked before that, and left out where it shows too briefly to be.
+    """
+    shown = np.asarray(shown, bool)
+    edges = np.diff(np.concatenate([[0], shown.astype(np.int8), [0]]))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    long = begins[1:] - ends[:-1] >= hidden_frames
+    starts = begins[1:][long]
+    stops = [
+        int(ends[:-1][long][number + 1]) if number + 1 < len(starts) else len(shown) for number in range(len(starts))
+    ]
+    found = []
+    for start, stop in zip(starts, stops, strict=True):
+        part = slice(int(start), stop)
+        if np.sum(shown[part]) >= num_frames:
+            found.append(time_to_lock(iou[part], shown[part], time_s[part], threshold=threshold, num_frames=num_frames))
+    return tuple(found)
+
+
 def moved_for(
     truth: Truth,
     epc: str,
@@ -206,6 +236,7 @@ class Scores:
 
     means: Mapping[str, MaskedMean] = dataclasses.field(default_factory=dict)
     lock_s: tuple[float, ...] = ()  # one element a tag that was shown
+    recover_s: tuple[float, ...] = ()  # one element a time that a tag's object showed again
 
     @classmethod
     def of(cls, frames: FrameScores, *, threshold: float = 0.5, lock_frames: int = 5) -> Scores:
@@ -221,10 +252,12 @@ class Scores:
             "found": found.astype(np.float64),
             "confidence": frames.confidence,
         }
-        lock = time_to_lock(iou, frames.shown, frames.time_s, threshold=threshold, num_frames=lock_frames)
+        rule = {"threshold": threshold, "num_frames": lock_frames}
+        lock = time_to_lock(iou, frames.shown, frames.time_s, **rule)
         return cls(
             {name: MaskedMean.of(values, valid) for name, values in columns.items()},
             () if np.isnan(lock) else (lock,),
+            times_to_recover(iou, frames.shown, frames.time_s, **rule),
         )
 
     @classmethod
@@ -237,10 +270,13 @@ class Scores:
         return Scores(
             {name: self.means.get(name, MaskedMean()).merge(other.means.get(name, MaskedMean())) for name in names},
             self.lock_s + other.lock_s,
+            self.recover_s + other.recover_s,
         )
 
     def result(self) -> dict[str, float | int | None]:
         """Named means, the count of frames they stand on, share of tags locked, median time to lock of those.
+
+        Where objects were hidden and showed again, also how often they were locked anew, and the median time to that.
 
         Undefined numbers are None, so that the result is plain JSON.
         """
@@ -253,4 +289,8 @@ class Scores:
         numbers["num_tags"] = len(self.lock_s)
         numbers["locked"] = len(locked) / len(self.lock_s) if self.lock_s else None
         numbers["time_to_lock_s"] = float(np.median(locked)) if locked else None
+        if self.recover_s:
+            recovered = [time for time in self.recover_s if np.isfinite(time)]
+            numbers["recovered"] = len(recovered) / len(self.recover_s)
+            numbers["time_to_recover_s"] = float(np.median(recovered)) if recovered else None
         return numbers
