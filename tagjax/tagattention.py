@@ -18,17 +18,19 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from ._numerics import logit, safe_norm, safe_sqrt
+from ._numerics import safe_norm, safe_sqrt
 from .anchor import Anchor, log_density, lost_drift_m, move_anchor, update_belief, votes
-from .attention import att_corr, att_rbf, attention, centre_first, coherent_score, read_support
-from .background import Background, empty_background, in_front, is_background, remember, shows_rest
+from .attention import att_corr, att_rbf, attention, coherent_score, read_support
+from .background import Background, empty_background, is_background, remember, shows_rest
 from .motion import MotionMap, carry, empty_motion, push_gather
+from .parameters import physical, stored_log, stored_logit, with_physical
 from .propagation import log_likelihood_ratio, propagate, radio_speed, soft_clip, velocity_gate
 from .rf.reads import PhaseReads, RadioWindow
-from .segmentation import Segments, cdf_cut, compact_cut, diffuse, pool, segment, segment_affinity, unpool
+from .segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
 from .tracer import AbstractTracer, Camera, Frame, Trace, describe
+from .view import Grouping, View, elapsed_s, view_of
 
 SIGNIFICANCE = 1e-3
 """Share of the pixels by which the histogram rises at a corner of its CDF."""
@@ -56,42 +58,6 @@ class TagAttentionState(eqx.Module):
     place: Place
     anchor: Anchor
     background: Background
-
-
-class _View(eqx.Module):
-    """One frame as all tags share it."""
-
-    points_m: Float[Array, "height width 3"]
-    distance_m: Float[Array, "height width"]
-    valid: Bool[Array, "height width"]
-    front: Float[Array, "height width"]
-    time_s: Float[Array, " window"]
-    segments: Segments
-    segment_range_m: Float[Array, "rows columns"]
-    segment_mass: Float[Array, "rows columns"]
-    affinity: Float[Array, "9 rows columns"]
-    rho: Float[Array, "height width window"]
-    known: Bool[Array, "height width"]
-    rho_segment: Float[Array, "rows columns window"]
-
-    @property
-    def elapsed_s(self) -> Float[Array, ""]:
-        return _elapsed_s(self.time_s)
-
-
-def _elapsed_s(time_s: Float[Array, " window"]) -> Float[Array, ""]:
-    """Since the frame before."""
-    return jnp.maximum(time_s[-1] - time_s[-2], 1e-3)
-
-
-def _log(value: float) -> Float[Array, ""]:
-    if value <= 0:
-        raise ValueError(f"A positive value is needed for a parameter kept as its logarithm; found {value}.")
-    return jnp.log(jnp.asarray(value, jnp.float32))
-
-
-def _logit(value: float) -> Float[Array, ""]:
-    return jnp.asarray(logit(min(max(value, 1e-6), 1.0 - 1e-6)), jnp.float32)
 
 
 def paper_limit() -> dict[str, Any]:
@@ -266,69 +232,44 @@ class TagAttention(AbstractTracer):
         """
         if cut_rule not in ("margin", "cdf_corner"):
             raise ValueError(f"cut_rule is {cut_rule!r}; expected 'margin' or 'cdf_corner'.")
-        self.log_alpha, self.logit_beta = _log(alpha_m2), _logit(beta)
-        self.log_floor, self.logit_background = _log(floor), _logit(background)
-        self.logit_profile, self.log_slack = _logit(profile), _log(slack)
-        self.log_noise_share, self.logit_rest = _log(noise_share), _logit(rest)
-        self.log_coherent_weight = _log(coherent_weight)
+        self.log_alpha, self.logit_beta = stored_log(alpha_m2), stored_logit(beta)
+        self.log_floor, self.logit_background = stored_log(floor), stored_logit(background)
+        self.logit_profile, self.log_slack = stored_logit(profile), stored_log(slack)
+        self.log_noise_share, self.logit_rest = stored_log(noise_share), stored_logit(rest)
+        self.log_coherent_weight = stored_log(coherent_weight)
         self.coherent_level = jnp.asarray(coherent_level, jnp.float32)
-        self.log_v0, self.log_gate_width = _log(v0_m_s), _log(gate_width_m_s)
-        self.log_memory, self.log_evidence_limit = _log(memory_s), _log(evidence_limit)
-        self.logit_pool_motion, self.logit_pool_log_odds = _logit(pool_motion), _logit(pool_log_odds)
-        self.log_segment_temperature = _log(segment_temperature)
-        self.logit_diffusion = _logit(diffusion)
-        self.log_affinity_length, self.log_affinity_speed = _log(affinity_length), _log(affinity_speed_m_s)
+        self.log_v0, self.log_gate_width = stored_log(v0_m_s), stored_log(gate_width_m_s)
+        self.log_memory, self.log_evidence_limit = stored_log(memory_s), stored_log(evidence_limit)
+        self.logit_pool_motion, self.logit_pool_log_odds = stored_logit(pool_motion), stored_logit(pool_log_odds)
+        self.log_segment_temperature = stored_log(segment_temperature)
+        self.logit_diffusion = stored_logit(diffusion)
+        self.log_affinity_length, self.log_affinity_speed = stored_log(affinity_length), stored_log(affinity_speed_m_s)
         self.cut = jnp.asarray(cut, jnp.float32)
-        self.log_cut_width, self.log_cut_margin = _log(cut_width), _log(cut_margin)
-        self.logit_cut_share = _logit(cut_share)
-        self.log_extent = _log(extent_m)
-        self.log_prior_weight, self.log_prior_reach = _log(prior_weight), _log(prior_reach)
-        self.logit_inertia, self.logit_size_rate = _logit(inertia), _logit(size_rate)
-        self.logit_range_share = _logit(range_share)
-        self.log_anchor_weight, self.log_anchor_width = _log(anchor_weight), _log(anchor_width_m)
-        self.log_anchor_depth, self.log_anchor_limit = _log(anchor_depth_m), _log(anchor_limit)
-        self.log_anchor_drift, self.log_anchor_rate = _log(anchor_drift_m), _log(anchor_rate)
+        self.log_cut_width, self.log_cut_margin = stored_log(cut_width), stored_log(cut_margin)
+        self.logit_cut_share = stored_logit(cut_share)
+        self.log_extent = stored_log(extent_m)
+        self.log_prior_weight, self.log_prior_reach = stored_log(prior_weight), stored_log(prior_reach)
+        self.logit_inertia, self.logit_size_rate = stored_logit(inertia), stored_logit(size_rate)
+        self.logit_range_share = stored_logit(range_share)
+        self.log_anchor_weight, self.log_anchor_width = stored_log(anchor_weight), stored_log(anchor_width_m)
+        self.log_anchor_depth, self.log_anchor_limit = stored_log(anchor_depth_m), stored_log(anchor_limit)
+        self.log_anchor_drift, self.log_anchor_rate = stored_log(anchor_drift_m), stored_log(anchor_rate)
         self.anchor_unseen = jnp.asarray(anchor_unseen, jnp.float32)
-        self.log_foreground_weight = _log(foreground_weight)
+        self.log_foreground_weight = stored_log(foreground_weight)
         self.cell, self.max_speed_m_s = cell, max_speed_m_s
         self.box_tail, self.doubled_angle = box_tail, doubled_angle
         self.anchor_bins, self.cut_rule = anchor_bins, cut_rule
 
     def physical(self) -> dict[str, float]:
         """The learnable parameters in physical units, by name."""
-        values = {}
-        for name, leaf in vars(self).items():
-            if isinstance(leaf, jax.Array):
-                if name.startswith("log_"):
-                    values[name.removeprefix("log_")] = float(jnp.exp(leaf))
-                elif name.startswith("logit_"):
-                    values[name.removeprefix("logit_")] = float(jax.nn.sigmoid(leaf))
-                else:
-                    values[name] = float(leaf)
-        return values
+        return physical(self)
 
     def with_physical(self, values: Mapping[str, float]) -> TagAttention:
         """The tracer with these parameters, named and in the units of `physical`, in place of its own.
 
         Raises `ValueError` for names that are missing or unknown, and for values that such a parameter cannot have.
         """
-        known = self.physical()
-        if set(values) != set(known):
-            lacking, surplus = sorted(set(known) - set(values)), sorted(set(values) - set(known))
-            raise ValueError(f"not this tracer's parameters: missing {lacking}, unknown {surplus}.")
-        leaves: dict[str, Array] = {}
-        for name in vars(self):
-            if name.startswith("log_"):
-                leaves[name] = _log(values[name.removeprefix("log_")])
-            elif name.startswith("logit_"):
-                share = values[name.removeprefix("logit_")]
-                if not 0 <= share <= 1:
-                    raise ValueError(f"{name.removeprefix('logit_')} is {share}; expected a share from 0 to 1.")
-                leaves[name] = _logit(share)
-            elif name in values:
-                leaves[name] = jnp.asarray(values[name], jnp.float32)
-        names = list(leaves)
-        return eqx.tree_at(lambda t: [getattr(t, name) for name in names], self, [leaves[name] for name in names])
+        return with_physical(self, values)
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         height, width = frame.depth_m.shape
@@ -355,10 +296,17 @@ class TagAttention(AbstractTracer):
         # What shows the surface that has always been there has not moved, whatever shadow runs over it.
         rests = shows_rest(state.background, distance, valid)
         backward_px = jnp.where(rests[..., None], 0.0, frame.backward_px)
-        motion = push_gather(state.motion, backward_px, distance, self.max_speed_m_s * _elapsed_s(time_s) + 0.05)
+        motion = push_gather(state.motion, backward_px, distance, self.max_speed_m_s * elapsed_s(time_s) + 0.05)
         recent = motion.valid[..., -1] & motion.valid[..., -2]
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
-        view = self._view(camera, points, distance, valid, motion, step_m, time_s, state.background)
+        grouping = Grouping(
+            temperature=jnp.exp(self.log_segment_temperature),
+            affinity_length=jnp.exp(self.log_affinity_length),
+            affinity_speed_m_s=jnp.exp(self.log_affinity_speed),
+            pool_motion=jax.nn.sigmoid(self.logit_pool_motion),
+            cell=self.cell,
+        )
+        view = view_of(camera, points, distance, valid, motion, step_m, time_s, state.background, grouping)
 
         moved = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), backward_px, jnp.zeros(())), -1, 0)
         # A surface that was hidden a frame ago brings no history of its own, but for what its pixel remembers.
@@ -377,62 +325,9 @@ class TagAttention(AbstractTracer):
     def finish(self, state: TagAttentionState) -> TagAttentionState:
         return state
 
-    def _view(
-        self,
-        camera: Camera,
-        points_m: Float[Array, "height width 3"],
-        distance_m: Float[Array, "height width"],
-        valid: Bool[Array, "height width"],
-        motion: MotionMap,
-        step_m: Float[Array, "height width"],
-        time_s: Float[Array, " window"],
-        background: Background,
-    ) -> _View:
-        """Segments, their motion, and what stands in front: once a frame, for all tags."""
-        features = self._features(camera, points_m, valid, step_m, _elapsed_s(time_s))
-        segments = segment(features, valid, jnp.exp(self.log_segment_temperature), cell=self.cell)
-        rho, known, rho_segment = self._pooled_motion(segments, motion)
-        means, mass = pool(
-            segments, jnp.concatenate([features, distance_m[..., None]], axis=-1), valid.astype(points_m.dtype)
-        )
-        affinity = segment_affinity(segments, means[..., :3], means[..., 3], jnp.exp(self.log_affinity_length))
-        return _View(
-            points_m=points_m,
-            distance_m=distance_m,
-            valid=valid,
-            front=in_front(background, distance_m, valid),
-            time_s=time_s,
-            segments=segments,
-            segment_range_m=means[..., 4],
-            segment_mass=mass,
-            affinity=affinity,
-            rho=rho,
-            known=known,
-            rho_segment=rho_segment,
-        )
-
-    def _features(
-        self,
-        camera: Camera,
-        points_m: Float[Array, "height width 3"],
-        valid: Bool[Array, "height width"],
-        step_m: Float[Array, "height width"],
-        elapsed_s: Float[Array, ""],
-    ) -> Float[Array, "height width 4"]:
-        """Position in cells, (x, y) / cell and (f / cell) log z, and step in units of `affinity_speed_m_s`.
-
-        Differences of position are metric ones over the width of a cell at that depth: segments of a thing in the
-        hand and of a walker far away are made alike.
-        """
-        focal_px = 1.0 / (camera.rays[0, 1, 0] - camera.rays[0, 0, 0])
-        depth_m = jnp.where(valid, points_m[..., 2], 1.0)
-        place = jnp.stack([camera.rays[..., 0], camera.rays[..., 1], jnp.log(depth_m)], axis=-1) * focal_px / self.cell
-        step = step_m / (jnp.exp(self.log_affinity_speed) * elapsed_s)
-        return jnp.concatenate([place, step[..., None]], axis=-1)
-
     def _trace_tag(
         self,
-        view: _View,
+        view: View,
         carried: Float[Array, "height width"],
         radio: RadioWindow,
         reads: PhaseReads,
@@ -479,23 +374,6 @@ class TagAttention(AbstractTracer):
         held = jnp.where(confidence > 0.5, (1.0 - rate) * place.radius_m + rate * radius, place.radius_m)
         return refined, mask, Place(centre, velocity, confidence, held), anchor
 
-    def _pooled_motion(
-        self, segments: Segments, motion: MotionMap
-    ) -> tuple[Float[Array, "height width window"], Bool[Array, "height width"], Float[Array, "rows columns window"]]:
-        """Motion vectors of pixels mixed with their segment's mean, where that is known, and the segments' own."""
-        num_window = motion.distance_m.shape[-1]
-        full = jnp.all(motion.valid, axis=-1)
-        own = jnp.where(full[..., None], centre_first(motion.distance_m, motion.valid), 0.0)
-        mean, mass = pool(segments, own, full.astype(own.dtype))
-        solid = (mass > 1.0).astype(own.dtype)[..., None]
-        spread = unpool(segments, jnp.concatenate([mean * solid, solid], axis=-1))
-        share = spread[..., num_window:]
-        has = share[..., 0] > 0.5
-        pooled = spread[..., :num_window] / jnp.maximum(share, 1e-3)
-        mix = jax.nn.sigmoid(self.logit_pool_motion)
-        blended = jnp.where(has[..., None], (1 - mix) * own + mix * pooled, own)
-        return jnp.where(full[..., None], blended, pooled), full | has, mean * solid
-
     def _gate(self, radio: RadioWindow, time_s: Float[Array, " window"]) -> Float[Array, ""]:
         """The soft step of Eq. 7, closed as well where the radio knows less than the kernel asks."""
         speed = radio_speed(radio.relative_m, time_s)
@@ -504,7 +382,7 @@ class TagAttention(AbstractTracer):
         gate = velocity_gate(speed, jnp.exp(self.log_v0), jnp.exp(self.log_gate_width))
         return gate * alpha / (alpha + uncertainty)
 
-    def _evidence(self, view: _View, radio: RadioWindow, reads: PhaseReads) -> Float[Array, "height width"]:
+    def _evidence(self, view: View, radio: RadioWindow, reads: PhaseReads) -> Float[Array, "height width"]:
         """Log-likelihood ratio of object against background at each pixel: Eqs. 4-6 and the coherent phase term."""
         everywhere = jnp.ones(view.rho.shape, dtype=bool)
         relative = radio.relative_m[None, None]
@@ -539,7 +417,7 @@ class TagAttention(AbstractTracer):
     def _update_anchor(
         self,
         anchor: Anchor,
-        view: _View,
+        view: View,
         evidence: Float[Array, "height width"],
         radio: RadioWindow,
         gate: Float[Array, ""],
@@ -561,7 +439,7 @@ class TagAttention(AbstractTracer):
 
     def _cut(
         self,
-        view: _View,
+        view: View,
         log_odds: Float[Array, "height width"],
         predicted_m: Float[Array, " 3"],
         place: Place,
