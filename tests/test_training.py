@@ -18,7 +18,7 @@ import synthetic_clips as synthetic
 
 from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
-from tagjax.training.loop import DivergedError, LoopSettings, train
+from tagjax.training.loop import DivergedError, LoopSettings, resumed, train
 from tagjax.training.loss import (
     ObjectiveSettings,
     agreement,
@@ -214,6 +214,22 @@ def _run(folder: Path, num_steps: int, *, interrupt_at: int | None = None):
             checkpoints=checkpoints,
             after_step=after_step,
         )
+
+
+def test_a_run_is_gone_on_with_only_where_that_is_allowed(tmp_path: Path) -> None:
+    trained = _run(tmp_path / "run", 3).state
+    state, _ = _fresh()
+    clips = synthetic.ClipCycle([synthetic.recording(40)])
+    with Checkpoints(tmp_path / "run" / "checkpoints") as checkpoints:
+        with pytest.raises(CheckpointError, match=r"run holds a run already; set resume=true"):
+            resumed(state, clips, checkpoints, allowed=False)
+        again = resumed(state, clips, checkpoints, allowed=True)
+    assert int(again.step) == 3
+    assert clips.get_state() == {"place": 6}  # three steps of two clips
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(trained), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with Checkpoints(tmp_path / "none" / "checkpoints") as checkpoints:
+        assert resumed(state, clips, checkpoints, allowed=False) is state
 
 
 def test_resuming_is_exact_bit_for_bit(tmp_path: Path) -> None:

@@ -21,14 +21,13 @@ from ..evaluation.report import write_json
 from ..flow.named import make_flow
 from ..flow.network import AbstractFlowNetwork
 from ..flow.weights import load_weights, save_weights
-from ..recording import RecordingError
 from ..sim.flow_pairs import FlowPair
 from .checkpoint import Checkpoints
 from .devices import check_batch, local
 from .flow_sources import flow_dataset, installed_photographs, validation_pairs
 from .flow_step import FlowTrainState, flow_step
 from .logging import Logger
-from .loop import train
+from .loop import resumed, train
 from .processes import is_first, joined
 from .step import make_optimizer
 
@@ -73,13 +72,10 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     held_out = validation_pairs(config.data.drawn)
     peers = {name: scores(flow_of_peer(name, held_out), held_out) for name in _PEERS}
     with Checkpoints(folder / "checkpoints") as checkpoints:
-        if checkpoints.steps():
-            if not config.resume:
-                raise RecordingError(f"{folder} holds a run already; set resume=true or choose another folder.")
-            state, data_state = checkpoints.restore(state)
-            samples.set_state(data_state)
-            console.print(f"Resumed at step {int(state.step)} of {config.loop.num_steps}.")
+        state = resumed(state, samples, checkpoints, allowed=config.resume)
         first_step = int(state.step)
+        if first_step:
+            console.print(f"Resumed at step {first_step} of {config.loop.num_steps}.")
         logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=first_step)
 
         def validate(state: FlowTrainState) -> dict[str, float]:

@@ -12,7 +12,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import jax
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from .checkpoint import Checkpoints
+from .checkpoint import CheckpointError, Checkpoints
 from .logging import Logger
 from .processes import any_process, is_first, share_of
 from .state import Stepped
@@ -86,6 +86,22 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         yield asked.is_set
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def resumed(state: StateT, samples: DataIterator, checkpoints: Checkpoints, *, allowed: bool) -> StateT:
+    """The newest checkpoint's state, with the samples at its place; the given state where there is no checkpoint.
+
+    Raises `CheckpointError` if there is one and going on is not `allowed`.
+    """
+    if not checkpoints.steps():
+        return state
+    if not allowed:
+        raise CheckpointError(
+            f"{checkpoints.folder.parent} holds a run already; set resume=true or choose another folder."
+        )
+    state, data_state = checkpoints.restore(state)
+    samples.set_state(data_state)
+    return state
 
 
 def train(

@@ -18,14 +18,14 @@ from ..data.clips import Clip, clip_dataset
 from ..evaluation.evaluate import RecordingResult, ScoreSettings, evaluate_recording
 from ..evaluation.report import plain, score_table, write_json, write_report
 from ..learned import load_parameters, save_parameters
-from ..recording import Recording, RecordingError
+from ..recording import Recording
 from ..tagattention import TagAttention
 from ..tracer import AbstractTracer
 from .checkpoint import Checkpoints
 from .flow_run import initial_network
 from .joint import JointModel, save_network
 from .logging import Logger
-from .loop import Trained, train
+from .loop import Trained, resumed, train
 from .processes import is_first, joined, share_of
 from .sources import clip_loader, training_recordings
 from .state import TrainState
@@ -145,11 +145,8 @@ def _train(
     # Every process looks at all of them: none has to wait for another that does.
     held_out = [clip for recording in validation for clip in validation_clips(recording, clips, colour=joint)]
     with Checkpoints(folder / "checkpoints") as checkpoints:
-        if checkpoints.steps():
-            if not config.resume:
-                raise RecordingError(f"{folder} holds a run already; set resume=true or choose another folder.")
-            state, data_state = checkpoints.restore(state)
-            source.set_state(data_state)
+        state = resumed(state, source, checkpoints, allowed=config.resume)
+        if int(state.step):
             console.print(f"Resumed at step {int(state.step)} of {config.loop.num_steps}.")
         logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=int(state.step))
 
