@@ -22,9 +22,9 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
-    from tagjax.baselines.goller.run import GollerConfig, run_goller
     from tagjax.config import from_mapping
     from tagjax.data.store import open_recording
+    from tagjax.evaluation.goller import GollerConfig, run_goller
 
     values = resolved(config)
     checked = from_mapping(GollerConfig, values)

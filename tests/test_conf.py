@@ -15,9 +15,9 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from tagjax.baselines.goller.run import GollerConfig
 from tagjax.config import EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
+from tagjax.evaluation.goller import GollerConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.tagattention import TagAttention

@@ -34,9 +34,7 @@ from tagjax.baselines.goller import (
     find_site,
     fit_antennas,
     fit_association,
-    follow,
     forward_filter,
-    ladder,
     load_calibration,
     locate,
     make_association,
@@ -50,15 +48,24 @@ from tagjax.baselines.goller import (
 )
 from tagjax.baselines.goller._antennas import POWER_SCALE_DB, response_db
 from tagjax.baselines.goller._blobs import BlobTracks, in_slots
-from tagjax.baselines.goller._evaluate import interval, outcomes, rates, thresholds
 from tagjax.baselines.goller._fit import true_states
-from tagjax.baselines.goller._handover import mean_curve
 from tagjax.baselines.goller._reads import RssiFrames, grid_statistic, rssi_frames
 from tagjax.baselines.goller._site import level_site
 from tagjax.baselines.goller._system import Calibration, empty_picture
-from tagjax.baselines.goller.run import GollerConfig, run_goller, scenario_paths
 from tagjax.config import from_mapping
 from tagjax.data.store import open_recording, save_recording
+from tagjax.evaluation.goller import (
+    GollerConfig,
+    follow,
+    ladder,
+    mean_curve,
+    outcomes,
+    rates,
+    run_goller,
+    scenario_paths,
+    thresholds,
+)
+from tagjax.evaluation.goller._tables import interval
 from tagjax.recording import Intrinsics, Recording, RecordingError, TagReads, Truth
 
 RNG = np.random.default_rng(0)

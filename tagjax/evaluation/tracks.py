@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -18,8 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from ..attention import att_corr, att_rbf, attention, coherent_score
 from ..baselines.tagview import ReadSettings, fit_pairs, hear
@@ -29,6 +26,8 @@ from ..rf.channels import estimate_slope
 from ..rf.windows import phase_reads, radio_windows
 from ..sim.reader import ReaderSettings
 from ..sim.virtual_tag import Track, virtual_reads
+from ..viz.tracks import accuracy_plot
+from .report import write_json
 
 METHODS = ("TagAttention, coherent", "TagAttention, Eqs. 4-6", "TagVision", "Tagview")
 """Whose scores are asked. Goller et al. need RSSI at several antennas and a calibration, which tracks do not have."""
@@ -262,9 +261,9 @@ def run_tracks(config: TracksConfig, folder: Path, *, on_done: Callable[[str], N
                 }
             )
             on_done(f"{scene.name}, {length_s:g} s")
-    (folder / "metrics.json").write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+    write_json(folder / "metrics.json", rows)
     (folder / "tables.md").write_text(markdown(rows))
-    _plot(folder / "accuracy.png", rows)
+    accuracy_plot(folder / "accuracy.png", rows, METHODS)
     return {"rows": rows}
 
 
@@ -285,25 +284,3 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         cells += [f"{row['accuracy'][name]:.2f}" for name in METHODS]
         lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
     return "\n".join(lines) + "\n"
-
-
-def _plot(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    names = list(dict.fromkeys(row["scene"] for row in rows))
-    figure = Figure(figsize=(4.2 * max(len(names), 1), 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, name in zip(np.atleast_1d(figure.subplots(1, max(len(names), 1), sharey=True)), names, strict=False):
-        mine = [row for row in rows if row["scene"] == name]
-        length = [row["window_s"] for row in mine]
-        for method in METHODS:
-            axes.plot(length, [row["accuracy"][method] for row in mine], "o-", label=method, markersize=4)
-        axes.plot(length, [row["chance"] for row in mine], "k:", label="chance")
-        axes.set(
-            xlabel="window (s)", ylim=(0, 1.03), xscale="log", xticks=length, xticklabels=[f"{s:g}" for s in length]
-        )
-        axes.set_title(name, fontsize=9)
-        axes.minorticks_off()
-        axes.grid(alpha=0.3)
-    if names:
-        figure.axes[0].set_ylabel("carrier has the highest score")
-        figure.axes[0].legend(fontsize=7, loc="lower right")
-    figure.savefig(path, dpi=110)

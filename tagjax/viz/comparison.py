@@ -6,16 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+
+from .figure import blank
 
 
 def bar_plot(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, float | None]]]) -> None:
     """A panel a measure: its value by system and suite, 0 to 1; a cross where there is none."""
     by_system = next(iter(panels.values()))
     systems, suites = list(by_system), list(dict.fromkeys(suite for row in by_system.values() for suite in row))
-    figure = Figure(figsize=(max(5.5, 1.5 * len(suites) + 2.0), 2.4 * len(panels) + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(max(5.5, 1.5 * len(suites) + 2.0), 2.4 * len(panels) + 0.6)
     grid = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
     width = 0.8 / len(systems)
     for axes, (measure, values) in zip(grid, panels.items(), strict=True):

@@ -7,16 +7,15 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+
+from .figure import blank
 
 
 def curve_panels(path: Path, curves: Mapping[str, Mapping[str, Float[np.ndarray, " time"]]]) -> None:
     """Write a PNG with a panel for each condition: mean box IoU against frame number, one line a point."""
     columns = min(2, len(curves))
     rows = -(-len(curves) // columns)
-    figure = Figure(figsize=(5.5 * columns, 3.2 * rows + 0.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(5.5 * columns, 3.2 * rows + 0.5)
     panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True, squeeze=False)).ravel()
     for axes, (condition, lines) in zip(panels, curves.items(), strict=False):
         for name, iou in lines.items():
@@ -32,8 +31,7 @@ def curve_panels(path: Path, curves: Mapping[str, Mapping[str, Float[np.ndarray,
 
 def parameter_panels(path: Path, best: Mapping[str, Mapping[float, float]]) -> None:
     """Write a PNG with a panel for each parameter: the best mean box IoU that each of its values allows."""
-    figure = Figure(figsize=(3.6 * len(best), 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(3.6 * len(best), 3.2)
     panels = figure.subplots(1, len(best), sharey=True, squeeze=False)[0]
     for axes, (name, values) in zip(panels, best.items(), strict=True):
         at = sorted(values)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+
+from .figure import blank
 
 
 def line_plot(
@@ -20,8 +20,7 @@ def line_plot(
     """Normalised score of every line, one panel a case: (title, one round, mean of all rounds)."""
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(4.3 * columns, 2.9 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(4.3 * columns, 2.9 * rows)
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
     for axes, (title, one, mean) in zip(grid, panels, strict=False):
         axes.axvline(true_m * 1e3, color="tab:red", linewidth=0.8, alpha=0.6)
@@ -41,8 +40,7 @@ def matching_plot(
     path: Path, share: Mapping[str, Mapping[float, float]], *, chance: float | None = None, target: float = 0.98
 ) -> None:
     """Share of tags matched to the right object against the time observed, one line a setting."""
-    figure = Figure(figsize=(5.5, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(5.5, 3.4)
     axes = figure.subplots()
     for name, line in share.items():
         axes.plot(list(line), list(line.values()), marker="o", markersize=4, linewidth=1.4, label=name)
@@ -59,8 +57,7 @@ def error_plot(
     path: Path, errors_mm: Mapping[str, Shaped[np.ndarray, " values"]], *, target_mm: float | None = None
 ) -> None:
     """Cumulative distribution of errors, one line a kind."""
-    figure = Figure(figsize=(5.5, 3.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(5.5, 3.4)
     axes = figure.subplots()
     most = 1.0
     for name, values in errors_mm.items():

@@ -174,46 +174,57 @@ def decide(calibration: Calibration, seen: Observations, settings: GollerSetting
 
     Raises `ValueError` where the calibration is of another number of antennas.
     """
+    blobs = jnp.asarray(seen.blobs.position_m), jnp.asarray(seen.blobs.identity)
+    return _decide(prepared(calibration, seen, settings), *blobs, settings.exit_antenna)
+
+
+class Prepared(eqx.Module):
+    """A recording's reads beside the models that are asked of them; tags lead."""
+
+    location: LocationModel
+    association: AssociationModel
+    grid: FloorGrid
+    time_s: Float[Array, " time"]
+    rssi_dbm: Float[Array, "*tag time antennas"]
+    heard: Bool[Array, "*tag time antennas"]
+    exit_x_m: Float[Array, ""]
+
+
+def prepared(calibration: Calibration, seen: Observations, settings: GollerSettings) -> Prepared:
+    """What was heard of a recording's tags, as the models take it.
+
+    Raises `ValueError` where the calibration is of another number of antennas.
+    """
     num = seen.rssi.heard.shape[2]
     calibrated = calibration.location.antennas.mean_m.shape[0]
     if num != calibrated:
         raise ValueError(
             f"{seen.name}: {num} antennas, calibrated are {calibrated}. Calibrate with this site's tag grid."
         )
-    return _decide(
+    return Prepared(
         calibration.location,
         calibration.association,
         floor_grid(calibration, settings),
         jnp.asarray(seen.time_s),
         jnp.asarray(np.moveaxis(seen.rssi.rssi_dbm, 1, 0)),
         jnp.asarray(np.moveaxis(seen.rssi.heard, 1, 0)),
-        jnp.asarray(seen.blobs.position_m),
-        jnp.asarray(seen.blobs.identity),
         jnp.asarray(settings.exit_x_m, jnp.float32),
-        settings.exit_antenna,
     )
 
 
 @eqx.filter_jit
 def _decide(
-    location: LocationModel,
-    association: AssociationModel,
-    grid: FloorGrid,
-    time_s: Float[Array, " time"],
-    rssi_dbm: Float[Array, "tag time antennas"],
-    heard: Bool[Array, "tag time antennas"],
-    blob_m: Float[Array, "time slots 2"],
-    identity: Int[Array, "time slots"],
-    exit_x_m: Float[Array, ""],
-    exit_antenna: int,
+    given: Prepared, blob_m: Float[Array, "time slots 2"], identity: Int[Array, "time slots"], exit_antenna: int
 ) -> Decision:
     def one(rssi, by):
-        path = locate(location, grid, time_s, rssi, by)
-        held = associate(association, time_s, path.position_m, path.velocity_m_s, path.heard, blob_m, identity)
-        score = exit_score(held.probability, blob_m, identity, exit_x_m)
+        path = locate(given.location, given.grid, given.time_s, rssi, by)
+        held = associate(
+            given.association, given.time_s, path.position_m, path.velocity_m_s, path.heard, blob_m, identity
+        )
+        score = exit_score(held.probability, blob_m, identity, given.exit_x_m)
         return Decision(path, held.probability, score, rssi_score(rssi, by, exit_antenna))
 
-    return jax.vmap(one)(rssi_dbm, heard)
+    return jax.vmap(one)(given.rssi_dbm, given.heard)
 
 
 def peak(score: Float[Array, "tag time"]) -> Float[np.ndarray, " tag"]:

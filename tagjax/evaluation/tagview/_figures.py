@@ -8,25 +8,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from ...baselines.tagview import middle_px
+from ...viz.figure import blank
 from ._judge import Judged, Watched
 
 PAPER_ACCURACY = {2: 0.99, 6: 0.96}
 """Fig. 10: the ends that the text names."""
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def pair_plot(path: Path, judged: Sequence[Judged]) -> None:
     """R^2 and slope of right and wrong pairs as boxes."""
-    figure = _figure(7.0, 3.6)
+    figure = blank(7.0, 3.6)
     both = figure.subplots(1, 2)
     for axes, kind, label in zip(both, ("r_squared", "slope"), ("R$^2$", "slope / (4$\\pi$h/$\\lambda$)"), strict=True):
         rows = np.concatenate([getattr(one, kind) for one in judged] or [np.zeros((2, 0))], axis=1)
@@ -41,7 +34,7 @@ def pair_plot(path: Path, judged: Sequence[Judged]) -> None:
 
 def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> None:
     """Accuracy by number of tags, one line a setting, and the paper's."""
-    figure = _figure(5.5, 4.0)
+    figure = blank(5.5, 4.0)
     axes: Axes = figure.subplots()
     for name, values in accuracy.items():
         counts = sorted(values)
@@ -55,7 +48,7 @@ def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> No
 
 def track_plot(path: Path, watched: Watched, picture: Shaped[np.ndarray, "height width 3"]) -> None:
     """True middles (black +) and those of the traces (green o) over a picture, every third frame (Fig. 7)."""
-    figure = _figure(7.0, 6.0)
+    figure = blank(7.0, 6.0)
     axes: Axes = figure.subplots()
     axes.imshow(picture)
     true, found = (middle_px(boxes[:, ::3]).reshape(-1, 2) for boxes in (watched.truth_px, watched.box_px))

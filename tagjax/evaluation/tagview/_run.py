@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from ...baselines.tagview import (
 )
 from ...data.store import open_recording
 from ...recording import Recording
+from ..report import write_json
 from ._figures import accuracy_plot, pair_plot, track_plot
 from ._judge import Judged, Watched, judge, watch
 from ._table import PAPER_GROUPS, quartiles, summarise, table
@@ -135,7 +135,7 @@ def run_tagview(
     if accuracy:
         accuracy_plot(folder / "accuracy.png", accuracy)
     _write_rows(folder / "recordings.csv", found)
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+    write_json(folder / "metrics.json", metrics)
     (folder / "report.md").write_text(table(metrics))
     return metrics
 
@@ -234,5 +234,5 @@ def train_tagview(
         "validation": {name: value for name, value in scores.items() if np.isfinite(value)},
     }
     save_detector(folder / training.weights, network, about)
-    (folder / "training.json").write_text(json.dumps(about, indent=1, allow_nan=False) + "\n")
+    write_json(folder / "training.json", about)
     return about

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from ...config import ConfigError, from_mapping
 from ...data.store import open_recording
 from ...sim.suites import SPLITS, Item, Suite, make_suite
 from ...viz.tagvision import error_plot, line_plot, matching_plot
+from ..report import write_json
 from ._calibration import PAPER_CAMERA, CalibrationSettings, calibrated, overhead, transform_error_m
 from ._lines import LineScores, LineSettings, line_scores
 from ._table import TagResult, judge, see, table_truth
@@ -70,7 +70,7 @@ def run_tagvision(
         if not items:
             raise ConfigError(f"{suite.name} has no {config.split} recording: raise benchmark.counts.{config.split}.")
         metrics["tracks"] = _tracks(config, items, folder, tell)
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+    write_json(folder / "metrics.json", metrics)
     (folder / "table.md").write_text(table(metrics) + "\n")
     return metrics
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from ._blobs import BlobTracks
+from ...baselines.goller import BlobTracks
 
 _CARRIED_M = 1.0  # a blob this close to a tag that moves may carry it
 _MOVES_M_S = 0.2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +12,27 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ...baselines.goller import (
+    Calibration,
+    Carried,
+    GollerSettings,
+    Observations,
+    calibrate,
+    carried,
+    decide,
+    find_site,
+    fit_association,
+    grid_statistic,
+    observe,
+    save_calibration,
+    true_states,
+)
 from ...recording import Recording
-from ._evaluate import (
+from ..report import write_json
+from ._figures import antenna_plot, association_plot, handover_plot, roc_plot, scene_picture
+from ._handover import Handover, follow
+from ._ladder import ladder
+from ._tables import (
     SIMPLE,
     TagOutcome,
     ladder_markdown,
@@ -27,13 +45,6 @@ from ._evaluate import (
     table_2,
     thresholds,
 )
-from ._figures import antenna_plot, association_plot, handover_plot, roc_plot, scene_picture
-from ._fit import Carried, carried, fit_association, true_states
-from ._handover import Handover, follow
-from ._ladder import ladder
-from ._reads import grid_statistic
-from ._site import find_site
-from ._system import Calibration, GollerSettings, Observations, calibrate, decide, observe, save_calibration
 
 Example = tuple[str, Observations, Carried]
 """Variant, what was seen, what was true."""
@@ -132,17 +143,13 @@ def run_goller(
         "never_read": sum(not one.read for one in found),
         "milliseconds_a_frame": {"both sensors, reading included": seen_ms, "location and association": decided_ms},
     }
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
-    (folder / "outcomes.json").write_text(json.dumps([_row(one) for one in found], indent=0, allow_nan=False) + "\n")
+    write_json(folder / "metrics.json", metrics)
+    write_json(folder / "outcomes.json", [dataclasses.asdict(one) for one in found])
     return metrics
 
 
 def _outcomes(calibration: Calibration, examples: list[Example], settings: GollerSettings) -> list[TagOutcome]:
     return [one for variant, seen, truth in examples for one in outcomes(calibration, variant, seen, truth, settings)]
-
-
-def _row(one: TagOutcome) -> dict[str, Any]:
-    return {**dataclasses.asdict(one), "rfid": one.rfid if np.isfinite(one.rfid) else None}
 
 
 def _fitted(calibration: Calibration) -> dict[str, Any]:

@@ -12,28 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from ._alarm import Roc
-from ._antennas import AntennaModel, response_db
-from ._evaluate import PAPER_TABLE_1
+from ...baselines.goller import AntennaModel, GridStatistic, Roc, response_db
+from ...viz.figure import blank
 from ._handover import Handover, mean_curve
-from ._reads import GridStatistic
+from ._tables import PAPER_TABLE_1
 
 _COLOURS = ("0.45", "tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown")
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def antenna_plot(path: Path, statistic: GridStatistic, model: AntennaModel) -> None:
     """Measured RSSI at the grid's places beside the fitted Gaussian of each antenna (Figs. 9 and 10)."""
     num, floor_dbm = model.mean_m.shape[0], float(model.floor_dbm)
-    figure = _figure(3.2 * num + 1, 4.6)
+    figure = blank(3.2 * num + 1, 4.6)
     heard = np.isfinite(statistic.mean_dbm)
     measured = np.where(heard, statistic.mean_dbm, floor_dbm)
     low, high = statistic.position_m.min(axis=0) - 0.3, statistic.position_m.max(axis=0) + 0.3
@@ -76,7 +67,7 @@ def roc_plot(path: Path, curves: Mapping[str, Roc], chosen: Mapping[str, tuple[f
 
     `chosen` maps a curve's name to its (P_D, P_FA).
     """
-    figure = _figure(5.5, 4.5)
+    figure = blank(5.5, 4.5)
     axes: Axes = figure.subplots()
     for number, (name, roc) in enumerate(curves.items()):
         colour = _COLOURS[1 + number]
@@ -108,7 +99,7 @@ def association_plot(
 
     `state` is the right one (0 background, 1 + slot, -1 not known). Below, the tag's x, located and true.
     """
-    figure = _figure(8.0, 5.0)
+    figure = blank(8.0, 5.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
     names = [name for name in dict.fromkeys(identity.ravel().tolist()) if name]
     true_name = np.where(
@@ -137,7 +128,7 @@ def association_plot(
 def handover_plot(path: Path, found: Sequence[Handover]) -> None:
     """Mean association probability over recordings by role, aligned at the hand-over; bands: one deviation."""
     times, mean, deviation = mean_curve(list(found))
-    figure = _figure(8.0, 3.6)
+    figure = blank(8.0, 3.6)
     axes: Axes = figure.subplots()
     for role, (name, colour) in enumerate((("background", "0.45"), ("giver", "tab:blue"), ("taker", "tab:orange"))):
         axes.plot(times, mean[:, role], color=colour, label=name)

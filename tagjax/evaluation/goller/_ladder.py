@@ -10,12 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._alarm import best_threshold, exit_score
-from ._association import AssociationModel, associate
-from ._evaluate import Kind, Rates, TagOutcome, rates, rule_roc
-from ._fit import Carried
-from ._location import FloorGrid, LocationModel, locate
-from ._system import Calibration, GollerSettings, Observations, floor_grid, peak
+from ...baselines.goller import (
+    Calibration,
+    Carried,
+    GollerSettings,
+    Observations,
+    Prepared,
+    associate,
+    best_threshold,
+    exit_score,
+    locate,
+    peak,
+    prepared,
+)
+from ._tables import Kind, Rates, TagOutcome, rates, rule_roc
 
 RUNGS: dict[str, tuple[bool, bool]] = {
     "as it is": (False, False),
@@ -67,17 +75,11 @@ def _outcomes(
         path = truth.position_m[rows].astype(np.float32)
         identity, blob_m = _with_true_blobs(seen, path, ~truth.still[rows] & blobs)
         scores = _score(
-            calibration.location,
-            calibration.association,
-            floor_grid(calibration, settings),
-            jnp.asarray(seen.time_s),
-            jnp.asarray(np.moveaxis(seen.rssi.rssi_dbm, 1, 0)),
-            jnp.asarray(np.moveaxis(seen.rssi.heard, 1, 0)),
+            prepared(calibration, seen, settings),
             jnp.asarray(path),
             jnp.asarray(places),
             jnp.asarray(blob_m),
             jnp.asarray(identity),
-            jnp.asarray(settings.exit_x_m, jnp.float32),
         )
         score = dict(zip(seen.epcs, peak(scores).tolist(), strict=True))
     out = []
@@ -103,25 +105,19 @@ def _with_true_blobs(
 
 @eqx.filter_jit
 def _score(
-    location: LocationModel,
-    association: AssociationModel,
-    grid: FloorGrid,
-    time_s: Float[Array, " time"],
-    rssi_dbm: Float[Array, "tag time antennas"],
-    heard: Bool[Array, "tag time antennas"],
+    given: Prepared,
     path_m: Float[Array, "tag time 2"],
     places: Bool[Array, ""],
     blob_m: Float[Array, "tag time slots 2"],
     identity: Int[Array, "tag time slots"],
-    exit_x_m: Float[Array, ""],
 ) -> Float[Array, "tag time"]:
     def one(rssi, by, path, blob, names):
-        where = locate(location, grid, time_s, rssi, by)
-        step_s = jnp.diff(time_s)[:, None]
+        where = locate(given.location, given.grid, given.time_s, rssi, by)
+        step_s = jnp.diff(given.time_s)[:, None]
         speed = jnp.diff(path, axis=0) / jnp.where(step_s > 0, step_s, 1.0)
         speed = jnp.concatenate([jnp.zeros_like(path[:1]), speed])
         place, velocity = jnp.where(places, path, where.position_m), jnp.where(places, speed, where.velocity_m_s)
-        held = associate(association, time_s, place, velocity, where.heard, blob, names)
-        return exit_score(held.probability, blob, names, exit_x_m)
+        held = associate(given.association, given.time_s, place, velocity, where.heard, blob, names)
+        return exit_score(held.probability, blob, names, given.exit_x_m)
 
-    return jax.vmap(one)(rssi_dbm, heard, path_m, blob_m, identity)
+    return jax.vmap(one)(given.rssi_dbm, given.heard, path_m, blob_m, identity)

@@ -9,9 +9,17 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._alarm import Roc, best_threshold, roc_curve
-from ._fit import Carried
-from ._system import Calibration, GollerSettings, Observations, decide, peak
+from ...baselines.goller import (
+    Calibration,
+    Carried,
+    GollerSettings,
+    Observations,
+    Roc,
+    best_threshold,
+    decide,
+    peak,
+    roc_curve,
+)
 
 Kind = Literal["leaves", "stays", "still"]
 
