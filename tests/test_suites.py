@@ -449,6 +449,17 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
     assert json.loads((home / MANIFEST).read_text())["seed"] == 5
 
 
+def test_a_suite_may_grow(tmp_path):
+    few, more = (dataclasses.replace(_tiny(), counts=Counts(0, 0, number)) for number in (1, 3))
+    for item in prepare(few, tmp_path):
+        item.path(tmp_path).mkdir(parents=True)
+    todo = prepare(more, tmp_path)
+    assert {item.number for item in todo} == {1, 2}
+    assert {(item.name, item.seed) for item in few.items()} < {(item.name, item.seed) for item in more.items()}
+    assert json.loads((tmp_path / "tiny" / MANIFEST).read_text())["counts"]["test"] == 3
+    assert prepare(few, tmp_path) == []
+
+
 def test_impossible_suites_are_refused():
     given = {"name": "x", "about": "x", "paper": "x", "story": "juggle", "seed": 1}
     with pytest.raises(ConfigError, match="unknown story 'juggle'"):

@@ -193,7 +193,8 @@ def make_item(item: Item, folder: Path) -> Made:
 def prepare(suite: Suite, folder: Path) -> list[Item]:
     """Check the output folder and say which recordings are still to be made; partial ones of a killed run are removed.
 
-    Raises `RecordingError`, and touches nothing, where the folder holds something else or another version of the suite.
+    The folder may hold the suite with other counts. Raises `RecordingError`, and touches nothing, where it holds something
+    else or another version of the suite.
     """
     home = folder / suite.name
     manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
@@ -204,13 +205,16 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
             raise RecordingError(
                 f"{home} holds something else (no readable {MANIFEST}). Name another folder with out=."
             ) from error
-        if found != manifest:
-            differs = sorted(key for key in {*found, *manifest} if found.get(key) != manifest.get(key))
+        differs = {key for key in {*found, *manifest} if found.get(key) != manifest.get(key)}
+        # A recording follows from its variant, split and number: more of them leave those there as they are.
+        if differs - {"counts"}:
             raise RecordingError(
-                f"{home} holds this suite with other settings ({', '.join(differs)}). Name another folder with out=."
+                f"{home} holds this suite with other settings ({', '.join(sorted(differs))}). Name another folder with out=."
             )
     else:
         home.mkdir(parents=True)
+        differs = {"counts"}
+    if differs:
         (home / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
     for partial in home.glob("*/.*.partial"):
         shutil.rmtree(partial, ignore_errors=True)
