@@ -8,13 +8,16 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
 
+from tagjax.attention import coherent_score
 from tagjax.config import from_mapping
 from tagjax.evaluation.tracks import (
     METHODS,
+    Scene,
     TracksConfig,
     antenna_place,
     association_scores,
@@ -26,6 +29,7 @@ from tagjax.evaluation.tracks import (
     windows,
 )
 from tagjax.recording import RecordingError
+from tagjax.rf.windows import phase_reads
 
 RATE_HZ = 15.0
 
@@ -137,6 +141,27 @@ def test_what_is_no_folder_of_tracks_is_refused(folder, tmp_path):
         TracksConfig("x", windows_s=(0.1,))
     with pytest.raises(ValueError, match="noise_m -1"):
         TracksConfig("x", noise_m=-1.0)
+
+
+def test_noise_of_a_track_costs_the_doubled_angle_more_than_flips_cost_the_plain_one():
+    """One person walks, the other stands; the walker's coherence is what noise and flips leave of 1, channel by channel."""
+    time_s = np.arange(0.0, 24.0, 1 / RATE_HZ)
+    walks = np.stack([3.0 + 1.0 * np.sin(2 * np.pi * time_s / 6.0), np.zeros(len(time_s))], axis=-1)
+    still = np.broadcast_to([4.0, 1.0], walks.shape)
+    scene = Scene("walk", time_s, np.stack([walks, still]))
+    config = TracksConfig("x", noise_m=0.02, region="fixed", flip_share=0.08, most=3)
+    seen = [window for window in windows(scene, 4.0, config) if window.carrier == 0]
+    scores = []
+    for one in seen:
+        given = jnp.asarray(one.distance_m[None], jnp.float32), phase_reads(one.reads, "virtual", 0)
+        frames = jnp.asarray(one.time_s, jnp.float32)
+        scores.append([float(coherent_score(*given, frames, doubled_angle=twice)[0, 0]) for twice in (True, False)])
+    doubled, plain = np.mean(scores, axis=0)
+    # Read between two frames' samples, noise is averaged: by 2/3 in variance.
+    turn = 4 * np.pi / 0.328 * 0.02 * (2 / 3) ** 0.5
+    assert plain == pytest.approx((1 - 2 * 0.08) * np.exp(-(turn**2) / 2), abs=0.1)
+    assert doubled == pytest.approx(np.exp(-((2 * turn) ** 2) / 2), abs=0.12)
+    assert plain > doubled + 0.2
 
 
 def test_the_configuration_names_every_setting():
