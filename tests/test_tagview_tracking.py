@@ -359,6 +359,25 @@ def test_the_tracer_finds_names_and_places_every_tag():
     assert float(last.step_m[1]) == pytest.approx(ranges[1] - ranges[0], abs=0.012)
 
 
+def test_a_known_height_places_tags_whatever_the_slope_says():
+    recording = _recording()
+    # The fit takes phases of another carrier for those of a higher ceiling.
+    reads = dataclasses.replace(recording.reads, carrier_hz=np.full(recording.reads.num_reads, 0.8 * CARRIER_HZ))
+    recording = dataclasses.replace(recording, reads=reads)
+    assert recording.truth is not None
+    true_m = np.array([recording.truth.tag_position_m[epc][-1] for epc in ("B", "A")])
+    place_m = {}
+    for height_m in (None, HEIGHT_M):
+        settings = dataclasses.replace(_tracer().settings, height_m=height_m)
+        *_, (_, last) = host_trace(TagviewTracer(settings, detector=Perfect()), recording, epcs=["B", "A"])
+        assert np.asarray(last.found).all()
+        place_m[height_m] = np.asarray(last.centre_m)
+    assert np.all(place_m[None][:, 2] > 1.1 * HEIGHT_M)
+    np.testing.assert_allclose(place_m[HEIGHT_M], true_m, atol=0.03)
+    with pytest.raises(ValueError, match=r"height_m is -1"):
+        TagviewSettings(height_m=-1.0)
+
+
 def test_the_past_is_not_changed_by_a_step():
     recording, tracer = _recording(), _tracer()
     camera = HostCamera(recording.intrinsics, np.asarray(recording.antennas_m), ("A", "B"))

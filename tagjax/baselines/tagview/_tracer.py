@@ -32,6 +32,9 @@ class TagviewSettings:
     decide_every_s: float = 0.5
     memory_s: float = 60.0
     least_trace_s: float = 0.4  # a shorter trace is no candidate
+    height_m: float | None = (
+        None  # of the camera over the plane of things' middles; None takes the fit's, see `_depth_m`
+    )
     detector: DetectorSettings = dataclasses.field(default_factory=DetectorSettings)
     tracks: SortSettings = dataclasses.field(default_factory=SortSettings)
     reads: ReadSettings = dataclasses.field(default_factory=ReadSettings)
@@ -43,6 +46,8 @@ class TagviewSettings:
                 f"memory_s {self.memory_s}, decide_every_s {self.decide_every_s}, least_trace_s {self.least_trace_s}; "
                 "expected positive, and not negative."
             )
+        if self.height_m is not None and not self.height_m > 0:
+            raise ValueError(f"height_m is {self.height_m}; expected positive, or None for the fit's.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,8 +186,8 @@ class TagviewTracer(AbstractHostTracer):
     ) -> Claim:
         ends = np.stack([box_px if before_px is None else before_px, box_px])
         direction = undistorted(middle_px(ends), np.ones(2, bool), camera.intrinsics)
-        place_m = state.height_m * np.concatenate([direction, np.ones((2, 1))], axis=1)
         antenna_m = camera.antennas_m[self.settings.reads.antenna - 1]
+        place_m = self._depth_m(state, antenna_m) * np.concatenate([direction, np.ones((2, 1))], axis=1)
         range_m = np.linalg.norm(place_m - antenna_m, axis=1)
         step_m = float(range_m[1] - range_m[0])
         corner = np.round(box_px + np.array([0.5, 0.5, -0.5, -0.5])).astype(int)
@@ -195,6 +200,15 @@ class TagviewTracer(AbstractHostTracer):
             confidence=state.confidence[number],
             step_m=step_m if np.isfinite(step_m) else 0.0,
         )
+
+    def _depth_m(self, state: ViewState, antenna_m: Shaped[np.ndarray, " 3"]) -> float:
+        """The plane's depth before the camera: the height that is known, or what the shared slope says (a = 4 pi h / wavelength).
+
+        Names need no more than that all slopes agree, and the paper asks nothing else of them. As a length the slope is a
+        poor one: where distances change by 0.1 m, multipath of 0.3 rad turns it by a tenth and more.
+        """
+        known = self.settings.height_m
+        return state.height_m + float(antenna_m[2]) if known is None else known
 
 
 def undistorted(
