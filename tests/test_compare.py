@@ -31,7 +31,7 @@ def _config(suites: list[str], **changes: Any) -> CompareConfig:
 
 
 CELLS = [
-    Cell("a", "tagattention", 2, 40, 0.9, 0.61, 12.3, 45.6, 1.0, None, 7.8),
+    Cell("a", "tagattention", 2, 40, 0.9, 0.61, 12.3, 45.6, 1.0, None, 7.8, settings="people"),
     Cell("a", "tagview", reason="the camera looks along the room"),
     Cell("b", "tagattention", 1, 10, 0.5, None, None, None, 0.0, 0.25, 8.0),
 ]
@@ -40,7 +40,7 @@ CELLS = [
 def test_the_table_says_figures_reasons_and_what_the_papers_say():
     lines = markdown(CELLS, {"a": "0.97 of theirs"}).splitlines()
     assert len({line.count("|") for line in lines}) == 1
-    assert lines[2] == "| `a` | tagattention | 0.900 | 0.610 | 12 | 46 | 1.000 | - | 8 | 2 | 0.97 of theirs |"
+    assert lines[2] == "| `a` | tagattention (people) | 0.900 | 0.610 | 12 | 46 | 1.000 | - | 8 | 2 | 0.97 of theirs |"
     assert "does not apply: the camera looks along the room" in lines[3]
     assert "0.97 of theirs" not in lines[3]
     assert " 0.250 " in lines[4]
@@ -97,4 +97,5 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()
     assert any("simulated" in line for line in told)
+    assert (paper.settings, vision.settings) == ("handheld", None)
     assert np.isfinite(vision.error_mm if vision.error_mm is not None else 0.0)

@@ -15,11 +15,15 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from tagjax.config import EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
+from experiments.compare import suites_named
+from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
+from tagjax.evaluation.compare import SystemSettings
+from tagjax.evaluation.evaluate import ScoreSettings
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
+from tagjax.sim.suites import PLANAR, Suite
 from tagjax.tagattention import TagAttention
 from tagjax.tracer import AbstractTracer
 
@@ -94,6 +98,36 @@ def test_forerunners_configurations_are_valid(name: str, schema: type) -> None:
     fields = {field.name for field in dataclasses.fields(schema)}
     assert from_mapping(schema, {key: value for key, value in values.items() if key in fields})
     assert set(values) - fields <= {"command", "progress", "training"}
+
+
+def test_the_comparison_takes_each_system_as_its_own_experiments_do() -> None:
+    systems = _compose("compare")["systems"]
+    vision, view = _compose("tagvision"), _compose("tagview")
+    assert systems["tagvision"] == vision["system"]
+    assert systems["tagvision_calibration"] == vision["calibration"]
+    assert systems["tagview"] == view["system"]
+    assert systems["goller"] == _compose("goller")["settings"]
+    # What is claimed on the way is one of the settings that are compared on the same tracks.
+    assert vision["matching"]["adapted"] == vision["system"]["match"]
+    assert view["matching"]["no_rssi"] == {name: view["system"][name] for name in ("reads", "match")}
+    for name, tracer in (("people", "tagattention"), ("handheld", "tagattention_handheld")):
+        assert systems["tagattention"][name]["tracer"] == _compose("train", f"tracer={tracer}")["tracer"]
+
+
+def test_frames_are_scored_alike_everywhere() -> None:
+    scores = [_compose(name)["scores"] for name in ("train", "evaluate", "compare")]
+    assert scores[0] == scores[1] == scores[2]
+    assert from_mapping(ScoreSettings, scores[0]) == ScoreSettings()
+
+
+def test_every_story_has_tracer_settings_in_the_comparison() -> None:
+    systems = from_mapping(SystemSettings, _compose("compare")["systems"])
+    for path in (CONF / "benchmark").glob("*.yaml"):
+        suite = from_mapping(Suite, suites_named(path.stem)[path.stem])
+        stories = {variant.story or suite.story for variant in suite.variants} - {PLANAR}
+        assert stories <= set(systems.settings_of), path.stem
+    with pytest.raises(ConfigError, match="settings_of names magic"):
+        dataclasses.replace(systems, settings_of={"crowd": "magic"})
 
 
 def test_a_misspelt_override_is_refused() -> None:

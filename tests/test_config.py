@@ -117,7 +117,7 @@ def _written(path: str) -> dict[str, Any]:
         ("data/default.yaml", "simulate", config.SimulateSettings),
         ("data/default.yaml", "virtual_tag", config.VirtualTagSettings),
         ("train.yaml", "scores", ScoreSettings),
-        ("evaluate.yaml", "scores", ScoreSettings),
+        ("scores/default.yaml", None, ScoreSettings),
         ("evaluate.yaml", "virtual_tag", config.VirtualTagSettings),
     ],
 )

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from scipy.stats import binomtest, multivariate_normal
 
 from tagjax.baselines._interface import host_trace
@@ -1154,8 +1155,8 @@ def test_recordings_that_it_cannot_do_are_named(shop, calibration):
 
 
 def test_the_configuration_names_every_setting():
-    values: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "conf" / "goller.yaml").read_text())
-    values.pop("hydra")
+    with initialize_config_dir(str(Path(__file__).parents[1].resolve() / "conf"), version_base="1.3"):
+        values: Any = OmegaConf.to_container(compose("goller"))
     config = from_mapping(GollerConfig, values)
     assert config.settings == GollerSettings()
     names = lambda kind: {field.name for field in dataclasses.fields(kind)}  # noqa: E731

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> 
 
 
 def _cell(
-    systems: Systems, system: str, suite: str, items: Iterable[Item], config: CompareConfig, tell: Callable[[str], None]
+    systems: Systems, system: str, suite: str, items: Sequence[Item], config: CompareConfig, tell: Callable[[str], None]
 ) -> Cell:
     tally, reason = _Tally(), None
     for item in items:
@@ -113,12 +113,13 @@ def _cell(
             _score(systems, system, item, recording, config.scores, tally)
         except (RecordingError, ValueError) as error:
             # Of one recording of many, a failure would change what the others' mean is of.
-            if tally.num:
+            if tally.num or isinstance(error, ConfigError):
                 raise
             reason = str(error).removeprefix(f"{recording.name}: ")
             break
     if not tally.num:
         return Cell(suite, system, reason=reason)
+    ways = sorted({way for item in items if (way := systems.chosen(system, item)) is not None})
     told = tally.scores.result()
     flat = [np.concatenate(parts) if parts else np.zeros(0) for parts in (tally.error_m, tally.still)]
     error_m, still = (part[np.isfinite(part)] for part in flat)
@@ -134,6 +135,7 @@ def _cell(
         told.get("found"),
         float(np.mean(still)) if len(still) else None,
         float(np.median(tally.pace_ms)),
+        settings=", ".join(ways) or None,
     )
 
 
@@ -145,7 +147,7 @@ def _score(
     places: list[np.ndarray] = []
     traces = _watched(systems.traces(system, item, recording, epcs), elapsed_s, places)
     quiet = dataclasses.replace(settings, num_pictures=1)
-    result = score_traces(traces, recording, epcs, stride=systems.stride(system), settings=quiet)
+    result = score_traces(traces, recording, epcs, stride=systems.stride(system, item), settings=quiet)
     tally.scores = tally.scores.merge(result.scores())
     tally.num += 1
     # The first piece compiles and fills caches.
@@ -193,7 +195,7 @@ def console_table(cells: Iterable[Cell]) -> Table:
             if cell.reason not in reasons:
                 reasons.append(cell.reason)
             values = [f"({reasons.index(cell.reason) + 1})", *[""] * (len(MEASURES) - 1)]
-        table.add_row(cell.suite, cell.system, *values)
+        table.add_row(cell.suite, cell.name, *values)
     table.caption = (
         "\n".join(f"({number}) does not apply: {reason}" for number, reason in enumerate(reasons, 1)) or None
     )

@@ -10,12 +10,12 @@ from typing import Any
 from ...baselines._interface import host_trace
 from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate
 from ...baselines.tagview import TagviewSettings, TagviewTracer
-from ...baselines.tagvision import TagVision, TagVisionSettings
+from ...baselines.tagvision import PlaneCamera, TagVision, TagVisionSettings
 from ...config import ClipSettings, ConfigError
 from ...data.store import open_recording
 from ...recording import Recording, RecordingError
 from ...sim.suites import Item
-from ...tracer import Trace
+from ...tracer import AbstractTracer, Trace
 from ...training.run import make_tracer
 from ...training.sources import clip_loader
 from ..evaluate import ScoreSettings, trace_recording
@@ -26,19 +26,39 @@ Traces = Iterator[tuple[int, Trace]]
 NAMES = ("tagattention", "tagattention_paper", "tagvision", "tagview", "goller")
 """TagAttention with what is learnable, to the letter of its paper, and its three forerunners."""
 
+TABLE = "tabletop"
+"""The story of things that move on one plane, below the camera."""
+
+DEVICE = NAMES[:2]
+"""Those that run compiled, on clips."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TracerSettings:
+    """One way to set TagAttention: the tracer by `_target_`, and the clips that it sees."""
+
+    tracer: Mapping[str, Any]
+    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+
 
 @dataclasses.dataclass(frozen=True)
 class SystemSettings:
-    """The settings of every system. The two TagAttentions are tracers by `_target_`, with the clips they see."""
+    """The settings of every system. TagAttention has several, by name; which a suite takes follows from its story."""
 
-    tagattention: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    tagattention_paper: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+    tagattention: Mapping[str, TracerSettings] = dataclasses.field(default_factory=dict)
+    settings_of: Mapping[str, str] = dataclasses.field(default_factory=dict)  # story to a name in `tagattention`
+    tagattention_paper: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # the tracer; clips as beside it
     tagvision: TagVisionSettings = dataclasses.field(default_factory=TagVisionSettings)
     tagvision_calibration: CalibrationSettings = dataclasses.field(default_factory=CalibrationSettings)
     tagview: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
     goller: GollerSettings = dataclasses.field(default_factory=GollerSettings)
     goller_grid: str | None = None  # recording of a tag at the places of a grid, which calibrates its antennas
+
+    def __post_init__(self) -> None:
+        if unknown := sorted(set(self.settings_of.values()) - set(self.tagattention)):
+            raise ConfigError(
+                f"settings_of names {', '.join(unknown)}; TagAttention's settings are {', '.join(self.tagattention)}."
+            )
 
 
 class Systems:
@@ -47,19 +67,36 @@ class Systems:
     def __init__(self, settings: SystemSettings, scores: ScoreSettings):
         self.settings, self.scores = settings, scores
         self._calibration: Calibration | None = None
-        self._tracers = {name: make_tracer(getattr(settings, name)) for name in NAMES[:2]}
+        self._tracers: dict[tuple[str, str | None], AbstractTracer] = {}
 
-    def stride(self, name: str) -> int:
+    def chosen(self, name: str, item: Item) -> str | None:
+        """Which of TagAttention's settings a recording takes, by the story that it tells; None for other systems.
+
+        Raises `ConfigError` for a story that `settings_of` does not name.
+        """
+        if name not in DEVICE:
+            return None
+        story = item.variant.story or item.suite.story
+        if story not in self.settings.settings_of:
+            raise ConfigError(
+                f"{item.suite.name} tells {story!r}: systems.settings_of does not say which of TagAttention's settings suit "
+                f"it; they are {', '.join(self.settings.tagattention)}."
+            )
+        return self.settings.settings_of[story]
+
+    def stride(self, name: str, item: Item) -> int:
         """Every how many pixels a system's masks have one."""
-        return self.settings.clips.stride if name in self._tracers else 1
+        way = self.chosen(name, item)
+        return 1 if way is None else self.settings.tagattention[way].clips.stride
 
     def traces(self, name: str, item: Item, recording: Recording, epcs: list[str]) -> Traces:
         """Frame numbers and traces. Raises `RecordingError` or `ValueError` where the method cannot apply."""
-        if name in self._tracers:
-            return self._device(name, recording, epcs)
+        way = self.chosen(name, item)
+        if way is not None:
+            return self._device(name, way, recording, epcs)
         make: dict[str, Callable[[], Any]] = {
             "tagvision": lambda: self._tagvision(item, recording),
-            "tagview": lambda: TagviewTracer(self.settings.tagview),
+            "tagview": lambda: self._tagview(item, recording),
             "goller": lambda: self._goller(recording),
         }
         if name not in make:
@@ -70,24 +107,42 @@ class Systems:
             raise RecordingError(reason)
         return host_trace(tracer, recording, epcs=epcs)
 
-    def _device(self, name: str, recording: Recording, epcs: list[str]) -> Traces:
-        clips = self.settings.clips
-        if name == "tagattention_paper":
-            clips = dataclasses.replace(clips, estimator="paper")
-        return trace_recording(self._tracers[name], recording, clip_loader(clips), epcs=epcs, settings=self.scores)
+    def _device(self, name: str, way: str, recording: Recording, epcs: list[str]) -> Traces:
+        settings, paper = self.settings.tagattention[way], name == "tagattention_paper"
+        clips = dataclasses.replace(settings.clips, estimator="paper") if paper else settings.clips
+        key = name, None if paper else way
+        if key not in self._tracers:
+            self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings.tracer)
+        return trace_recording(self._tracers[key], recording, clip_loader(clips), epcs=epcs, settings=self.scores)
+
+    def _plane(self, item: Item, recording: Recording) -> PlaneCamera:
+        """The camera as it was calibrated on the table, which both TagVision and Tagview take."""
+        truth = table_truth(item, recording)
+        return calibrated(truth.camera, truth.area_m, self.settings.tagvision_calibration)
 
     def _tagvision(self, item: Item, recording: Recording) -> TagVision:
-        if item.suite.story != "tabletop":
+        if item.suite.story != TABLE:
             raise RecordingError("no calibrated plane: things do not move on one")
-        truth = table_truth(item, recording)
-        camera = calibrated(truth.camera, truth.area_m, self.settings.tagvision_calibration)
-        return TagVision(camera, self.settings.tagvision)
+        return TagVision(self._plane(item, recording), self.settings.tagvision)
+
+    def _tagview(self, item: Item, recording: Recording) -> TagviewTracer:
+        settings = self.settings.tagview
+        if item.suite.story != TABLE:
+            raise RecordingError("the camera does not look straight down on a plane that things move on")
+        if settings.height_m is None:
+            over_m = float(self._plane(item, recording).position_m[2]) - self.settings.tagvision.height_m
+            settings = dataclasses.replace(settings, height_m=over_m)
+        return TagviewTracer(settings)
 
     def _goller(self, recording: Recording) -> GollerTracer:
         if len(recording.antennas_m) < 2:
             raise RecordingError("location by proximity needs several antennas")
         if self._calibration is None:
-            if self.settings.goller_grid is None:
-                raise RecordingError("antennas not calibrated: name a grid's recording in systems.goller_grid")
-            self._calibration = calibrate(open_recording(Path(self.settings.goller_grid)))
+            grid = self.settings.goller_grid
+            if grid is None or not Path(grid).exists():
+                raise RecordingError(
+                    f"antennas not calibrated: systems.goller_grid names no recording of a tag grid ({grid}); "
+                    "`python -m experiments.simulate benchmark=shop_grid` makes one"
+                )
+            self._calibration = calibrate(open_recording(Path(grid)))
         return GollerTracer(self._calibration, self.settings.goller).at(recording)

@@ -32,6 +32,12 @@ class Cell:
     p_fa: float | None = None
     ms_a_frame: float | None = None
     reason: str | None = None
+    settings: str | None = None  # which of several the system took
+
+    @property
+    def name(self) -> str:
+        """The system, and its settings where it has several."""
+        return self.system if self.settings is None else f"{self.system} ({self.settings})"
 
 
 def said(value: float | None, measure: str) -> str:
@@ -55,7 +61,7 @@ def markdown(cells: Sequence[Cell], papers: Mapping[str, str]) -> str:
             values = " | ".join(said(getattr(cell, measure), measure) for measure in MEASURES)
         else:
             values = f"does not apply: {cell.reason}" + " |" * (len(HEADS) - 1)
-        lines.append(f"| `{cell.suite}` | {cell.system} | {values} | {cell.num_recordings or ''} | {paper} |")
+        lines.append(f"| `{cell.suite}` | {cell.name} | {values} | {cell.num_recordings or ''} | {paper} |")
     return "\n".join(lines)
 
 
