@@ -13,6 +13,9 @@ from jaxtyping import Array, Bool, Float, UInt8
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import bounding_box
 
+CLAIM = 0.505
+"""A claim takes more confidence than this: what rests stays within half a percent of even odds, where nothing speaks for one."""
+
 
 class Camera(eqx.Module):
     """The camera at the working resolution, and the antenna beside it."""
@@ -97,5 +100,5 @@ def describe(
         centre_m=centre_m,
         step_m=change,
         confidence=confidence,
-        found=(confidence > 0.5) & (total > 0),
+        found=(confidence > CLAIM) & (total > 0),
     )

@@ -14,7 +14,7 @@ from tagjax.motion import empty_motion, push_gather, push_splat
 from tagjax.rf.reads import RadioWindow
 from tagjax.tagattention import TagAttention, paper_limit
 from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
-from tagjax.tracer import Frame, trace
+from tagjax.tracer import Frame, describe, trace
 
 
 def _learnable():
@@ -229,6 +229,15 @@ def test_gathering_does_not_cross_a_depth_edge():
     past = np.asarray(moved.distance_m[..., 1])
     np.testing.assert_allclose(past[known], np.asarray(depth)[known], atol=1e-6)
     assert known[:, 9].all()
+
+
+def test_even_odds_are_no_claim():
+    mask, nothing = jnp.ones((3, 4, 5)), jnp.zeros((3, 3))
+    confidence = jnp.asarray([0.5, 0.503, 0.51])
+    out = describe(mask, nothing, jnp.zeros((4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
+    assert out.found.tolist() == [False, False, True]
+    empty = describe(0.0 * mask, nothing, jnp.zeros((4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
+    assert not empty.found.any()
 
 
 def test_only_frames_and_reads_enter(clip):

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.lines import Line2D
 
 from .figure import blank
 
@@ -34,7 +35,13 @@ def bar_plot(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, float | 
         axes.grid(axis="y", alpha=0.3)
         axes.set_axisbelow(True)
     grid[-1].set_xticks(np.arange(len(suites)), suites, rotation=20 if len(suites) > 4 else 0)
+    handles, labels = grid[0].get_legend_handles_labels()
+    cross = Line2D([], [], color="grey", marker="x", linestyle="none")
     figure.legend(
-        *grid[0].get_legend_handles_labels(), loc="outside upper center", ncols=min(5, len(systems)), fontsize=8
+        [*handles, cross],
+        [*labels, "does not apply"],
+        loc="outside upper center",
+        ncols=min(6, len(systems) + 1),
+        fontsize=8,
     )
     figure.savefig(path, dpi=120)
