@@ -97,5 +97,5 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()
     assert any("simulated" in line for line in told)
-    assert (paper.settings, vision.settings) == ("handheld", None)
+    assert (paper.settings, vision.settings) == ("people", None)
     assert np.isfinite(vision.error_mm if vision.error_mm is not None else 0.0)

@@ -127,7 +127,9 @@ def test_estimates_go_from_rough_to_the_pictures_size(name, strides):
     assert 128 % network.divisor == 0
 
 
-@pytest.mark.parametrize("name", [*TINY])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "raft_small_lean" else name for name in TINY]
+)
 def test_from_scratch_the_flow_is_nearly_zero(name):
     first, second = _pictures(_side(name), _side(name))
     for other in (second, first):

@@ -235,6 +235,7 @@ def test_refined_paths_have_the_gradient_of_their_reads(gradients_agree):
     gradients_agree(path, (reads.phase_rad,), atol=1e-5, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_windowed_distances_have_the_gradient_of_the_phases(gradients_agree):
     rng = np.random.default_rng(0)
     table = simulate_reads(rng, smooth_path(rng, 0.8, 1.2), 1.2)

@@ -96,7 +96,13 @@ def _degenerate(frames: Frame):
     yield "standing still", eqx.tree_at(lambda f: f.radio, frames, still)
 
 
-@pytest.mark.parametrize("tracer", [_learnable(), TagAttentionPaper(cell=4)], ids=["learnable", "paper"])
+@pytest.mark.parametrize(
+    "tracer",
+    [
+        pytest.param(_learnable(), id="learnable"),
+        pytest.param(TagAttentionPaper(cell=4), id="paper", marks=pytest.mark.slow),
+    ],
+)
 def test_gradients_reach_every_parameter_and_stay_finite_at_degenerate_input(clip, tracer):
     """One compilation for all of it."""
     (_, _), gradient = _total_and_gradient(tracer, clip.camera, clip.frames)

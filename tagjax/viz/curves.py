@@ -24,7 +24,7 @@ def score_curves(
     `lines` maps a tracer's name to its `iou` and `cle_px`; frames that are not scored are shaded.
     """
     frame = first_frame + np.arange(len(valid))
-    figure = blank(8, 5)
+    figure = blank(8.0, 5.0)
     upper, lower = figure.subplots(2, 1, sharex=True)
     for name, line in lines.items():
         upper.plot(frame, line["iou"], label=name, linewidth=1.4)
@@ -53,7 +53,7 @@ def training_curves(
     path: Path, steps: Float[np.ndarray, " step"], terms: Mapping[str, Float[np.ndarray, " step"]]
 ) -> None:
     """Write a PNG with each term of the training objective against the step."""
-    figure = blank(8, 2.2 * max(len(terms), 1))
+    figure = blank(8.0, 2.2 * max(len(terms), 1))
     for axes, (name, values) in zip(
         np.atleast_1d(figure.subplots(len(terms), 1, sharex=True)), terms.items(), strict=True
     ):
