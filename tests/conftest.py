@@ -59,6 +59,7 @@ def check_gradients(function, arguments, *, atol: float = 1e-6, rtol: float = 1e
         shape = jax.eval_shape(function, *arguments)
         direction = jnp.asarray(np.random.default_rng(0).normal(size=shape.shape))
 
+        @jax.jit
         def scalar(*args):
             return jnp.sum(direction * function(*args))
 

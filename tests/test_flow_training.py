@@ -379,6 +379,7 @@ def configured(tmp_path: Path, **more) -> TrainFlowConfig:
     return dataclasses.replace(config, data=dataclasses.replace(config.data, drawn=drawn(tmp_path / "drawn")))
 
 
+@pytest.mark.slow
 def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> None:
     score = run_flow_training(configured(tmp_path), tmp_path / "run")
     told = json.loads((tmp_path / "run" / "metrics.json").read_text())

@@ -176,6 +176,7 @@ def _pictures(count, seed=0, size=(48, 64)):
     return frames
 
 
+@pytest.mark.slow
 def test_training_learns_and_weights_come_back(tmp_path):
     settings = TrainSettings(num_steps=60, batch=4, crop_px=(32, 48), widths=(4, 8, 8), depth=1, learning_rate=0.01)
     losses = []

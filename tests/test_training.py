@@ -143,6 +143,7 @@ def test_gradient_agrees_with_finite_differences() -> None:
         assert float(logged["loss"]) == pytest.approx(float(loss(level)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_rematerialising_changes_nothing_but_memory() -> None:
     clip = _clip(12)
     kept = ObjectiveSettings(span_frames=8, skip_frames=4, future_stride=1, rematerialise=False)
