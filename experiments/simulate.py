@@ -20,19 +20,13 @@ def main(config: DictConfig) -> None:
     from pathlib import Path
 
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     from tagjax.config import SimulateConfig, from_mapping
     from tagjax.recording import RecordingError
     from tagjax.sim.suites import Suite, make_suite
     from tagjax.viz.contact_sheet import save_glance, save_sheet
+
+    from .progress import counting_bar
 
     values = resolved(config)
     sheets = values.pop("sheet", None)
@@ -45,15 +39,8 @@ def main(config: DictConfig) -> None:
     if sheets is not None:
         console.print(f"{suite.name}: {save_glance(suite, Path(sheets), workers=checked.workers or 1)}")
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
     total = len(suite.items())
-    with Progress(*columns, console=console, disable=not checked.progress) as bar:
+    with counting_bar(console, shown=checked.progress) as bar:
         task = bar.add_task(suite.name, total=total)
         here = sum(item.path(Path(checked.out)).exists() for item in suite.items())
         bar.update(task, completed=here)

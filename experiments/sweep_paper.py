@@ -24,25 +24,19 @@ from .train import CONFIGS, resolved
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="sweep_paper")
 def main(config: DictConfig) -> float:
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     from tagjax.config import from_mapping
     from tagjax.evaluation.report import plain
     from tagjax.evaluation.sweep import SweepConfig, run_sweep, table
 
+    from .progress import counting_bar
+
     values = resolved(config)
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
     progress, names = values.pop("progress"), values.pop("suites")
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.description}"), disable=not progress) as bar:
+    console = Console()
+    with counting_bar(console, shown=progress) as bar:
         task = bar.add_task("sweep", total=None)
 
         def tell(done: int, total: int, name: str) -> None:
@@ -54,7 +48,6 @@ def main(config: DictConfig) -> float:
         except ValueError as error:
             raise SystemExit(f"sweep_paper: {error}") from error
     rows = table(lines)
-    console = Console()
     console.print((folder / "table.md").read_text(), soft_wrap=True, highlight=False)
     console.print(f"table.md, table.csv, sweep.png, lines.jsonl in {folder}", soft_wrap=True, highlight=False)
     print(json.dumps(plain(rows), allow_nan=False))

@@ -149,3 +149,7 @@ def test_the_true_distances_may_stand_in_for_the_radio(recording: Recording) -> 
     partly = dataclasses.replace(recording.truth, tag_range_m={"tag-a": recording.truth.tag_range_m["tag-a"]})
     with pytest.raises(RecordingError, match="true range of tag-b; truth holds that of: tag-a"):
         load_clip(dataclasses.replace(recording, truth=partly), 3, 12, **SMALL, estimator="truth")
+    turned = dataclasses.replace(recording.reads, antenna=np.full(recording.reads.num_reads, 2, np.int16))
+    elsewhere = dataclasses.replace(recording, reads=turned, antennas_m=np.zeros((2, 3)))
+    with pytest.raises(RecordingError, match="true ranges are to antenna 1 and the clip's are to antenna 2"):
+        load_clip(elsewhere, 3, 12, **SMALL, estimator="truth")

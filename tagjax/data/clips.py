@@ -131,10 +131,9 @@ def load_clip(
     depth = recording.depth_metres(slice(start, stop))
     if recording.depth_kind == "range":
         depth = range_to_depth(depth, recording.intrinsics)
+    depth = _thin_depth(depth, stride)
     if colour:
-        forward = backward = np.zeros((stop - start, *recording.colour.shape[1:3], 2), np.float32)[
-            :, ::stride, ::stride
-        ]
+        forward = backward = np.zeros((*depth.shape, 2), np.float32)
     else:
         forward, backward = (
             ways[:, ::stride, ::stride] / np.float32(stride) for ways in pair_flow(recording, start, stop, flow)
@@ -146,7 +145,7 @@ def load_clip(
     origin_ns = int(recording.time_ns[0])
     buffers = [phase_reads(recording.reads, epc, origin_ns, length=length, antenna=antenna) for epc in named]
     if estimator == "truth":
-        radio = [_true_window(recording, epc, window) for epc in named]
+        radio = [_true_window(recording, epc, window, antenna) for epc in named]
     else:
         radio = [radio_windows(reads, time_s, window, estimator) for reads in buffers]
     reads = [_window(reads, time_s, window, max_reads) for reads in buffers]
@@ -161,7 +160,7 @@ def load_clip(
         ),
         frames=Frame(
             time_s=time_s[start:stop],
-            depth_m=jnp.asarray(_thin_depth(depth, stride)),
+            depth_m=jnp.asarray(depth),
             backward_px=jnp.asarray(backward),
             forward_px=jnp.asarray(forward),
             radio=per_tag(radio),
@@ -175,9 +174,14 @@ def load_clip(
     )
 
 
-def _true_window(recording: Recording, epc: str, num_window: int) -> RadioWindow:
-    """The true distances to the first antenna, with next to no doubt; unknown ones are infinitely doubtful."""
+def _true_window(recording: Recording, epc: str, num_window: int, antenna: int) -> RadioWindow:
+    """The true distances to the antenna, with next to no doubt; unknown ones are infinitely doubtful."""
     truth = recording.truth
+    if antenna != 1:
+        raise RecordingError(
+            f"{recording.name}: estimator=truth, but true ranges are to antenna 1 and the clip's are to antenna {antenna}. "
+            "Set antenna=1."
+        )
     if truth is None or epc not in truth.tag_range_m:
         there = ", ".join(truth.tag_range_m) if truth is not None else ""
         raise RecordingError(

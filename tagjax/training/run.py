@@ -107,11 +107,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     iou = summary["learned"]["all"].get("iou")
     if iou is not None:
         return float(iou)
-    joint = config.joint is not None
-    held_out = [
-        clip for recording in validation for clip in validation_clips(recording, config.data.clips, colour=joint)
-    ]
-    return held_out_numbers(trained.state, held_out, config)["own_coherence"]
+    return held_out_numbers(trained.state, held_out_clips(config, validation), config)["own_coherence"]
 
 
 def _train(
@@ -124,7 +120,6 @@ def _train(
     """The trained state, and the logger, which is left open for the report."""
     clips, batch_size = config.data.clips, config.loop.batch_size
     state, optimizer = initial_state(config)
-    joint = config.joint is not None
     source = iter(
         clip_dataset(
             training,
@@ -133,7 +128,7 @@ def _train(
             epcs=clips.epcs,
             workers=clips.workers,
             share=(jax.process_index(), jax.process_count()),
-            colour=joint,
+            colour=config.joint is not None,
             **clips.arguments(),
         )
     )
@@ -143,7 +138,7 @@ def _train(
             f"loop.batch_size={batch_size} leaves {idle} of {jax.local_device_count()} devices without a clip."
         )
     # Every process looks at all of them: none has to wait for another that does.
-    held_out = [clip for recording in validation for clip in validation_clips(recording, clips, colour=joint)]
+    held_out = held_out_clips(config, validation)
     with Checkpoints(folder / "checkpoints") as checkpoints:
         state = resumed(state, source, checkpoints, allowed=config.resume)
         if int(state.step):
@@ -216,12 +211,16 @@ def held_out_numbers(state: TrainState, clips: Sequence[Clip], config: TrainConf
     return {name: float(np.mean([float(one[name]) for one in ones])) for name in ones[0]}
 
 
-def validation_clips(recording: Recording, settings: ClipSettings, *, colour: bool = False) -> list[Clip]:
-    """A few clips spread over a recording, of the training clips' length (or shorter); `colour` as of `load_clip`."""
-    length = min(settings.length, recording.num_frames)
-    starts = np.linspace(0, recording.num_frames - length, VALIDATION_CLIPS).astype(int)
-    load = clip_loader(settings, colour=colour)
-    return [load(recording, int(start), int(start) + length) for start in sorted(set(starts.tolist()))]
+def held_out_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list[Clip]:
+    """A few clips spread over each recording, of the training clips' length (or shorter, if the recording is)."""
+    settings = config.data.clips
+    load = clip_loader(settings, colour=config.joint is not None)
+    clips = []
+    for recording in recordings:
+        length = min(settings.length, recording.num_frames)
+        starts = np.linspace(0, recording.num_frames - length, VALIDATION_CLIPS).astype(int)
+        clips += [load(recording, int(start), int(start) + length) for start in sorted(set(starts.tolist()))]
+    return clips
 
 
 def evaluate_tracers(
