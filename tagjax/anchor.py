@@ -28,14 +28,14 @@ _SHARPNESS = 4.0
 class Anchor(eqx.Module):
     """Distance travelled at the window's frames, and log probabilities of the starting range in bins of `BIN_M`."""
 
-    travelled_m: Float[Array, "*tag window"]
-    belief: Float[Array, "*tag bins"]
+    travelled_m: Float[Array, "*batch window"]
+    belief: Float[Array, "*batch bins"]
 
     @classmethod
-    def unknown(cls, num_tags: int, num_window: int, num_bins: int) -> Anchor:
+    def unknown(cls, *batch: int, num_window: int, num_bins: int) -> Anchor:
         """Nothing travelled, nothing known."""
         uniform = -jnp.log(jnp.asarray(float(num_bins)))
-        return cls(jnp.zeros((num_tags, num_window)), jnp.full((num_tags, num_bins), uniform))
+        return cls(jnp.zeros((*batch, num_window)), jnp.full((*batch, num_bins), uniform))
 
 
 def _start_m(anchor: Anchor) -> Float[Array, " bins"]:

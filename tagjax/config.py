@@ -15,7 +15,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
-from .data.clips import Estimator, check_clip
+from .data.clips import Antennas, Estimator, check_clip
 from .evaluation.evaluate import ScoreSettings
 from .flow.losses import FlowLossSettings
 from .training.flow_sources import FlowDataSettings
@@ -42,7 +42,7 @@ class ClipSettings:
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
     estimator: Estimator = "robust"  # of the tags' distances
-    antenna: int | None = None  # that distances are to; the one with the most reads if None
+    antennas: Antennas = None  # that distances are to: `all`, numbers from 1, or the one with the most reads if None
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
     workers: int = 0  # processes that load training clips; with none a thread does
@@ -54,7 +54,7 @@ class ClipSettings:
 
     def arguments(self) -> dict[str, Any]:
         """What `load_clip` and `clip_dataset` both take, by name."""
-        names = ("stride", "flow", "window", "max_reads", "estimator", "antenna")
+        names = ("stride", "flow", "window", "max_reads", "estimator", "antennas")
         return {name: getattr(self, name) for name in names}
 
 
@@ -227,7 +227,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             if type(None) in arguments:
                 return None
             raise wrong
-        return _convert(next(a for a in arguments if a is not type(None)), value, where)
+        return _convert_to_any([a for a in arguments if a is not type(None)], value, where)
     if origin is Literal:
         if value not in arguments:
             raise ConfigError(f"{where}: found {value!r}; expected one of {', '.join(map(repr, arguments))}.")
@@ -254,6 +254,19 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):  # pyright: ignore[reportArgumentType]
         raise wrong
     return value
+
+
+def _convert_to_any(hints: Sequence[Any], value: Any, where: str) -> Any:
+    """The first of the alternatives that takes the value."""
+    wrongs = []
+    for hint in hints:
+        try:
+            return _convert(hint, value, where)
+        except ConfigError as wrong:
+            wrongs.append(wrong)
+    if len(wrongs) == 1:
+        raise wrongs[0]
+    raise ConfigError(f"{where}: found {value!r}; none of these: " + "; ".join(str(wrong) for wrong in wrongs))
 
 
 def build(settings: Mapping[str, Any], *, where: str = "_target_") -> Any:

@@ -1,7 +1,7 @@
 """TagAttention as a learnable tracer: the paper's stages, each hard step relaxed, each constant a parameter.
 
 Per frame: the motion map slides (Eq. 3); pixels are grouped into 3D segments; attention compares each one's motion
-with the tag's (Eqs. 4-6), and coherence compares it with the raw phase reads; the log-odds map is carried along the
+with the tag's (Eqs. 4-6), and coherence and phase memory with the raw phase reads; the log-odds map is carried along the
 flow and updated (Eq. 7 with a background class and forgetting), pooled in the segments (III.G), and cut.
 
 What goes beyond the paper: the range anchor, by which all of the past says how far away the tag is now; a memory of
@@ -20,17 +20,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._numerics import safe_norm, safe_sqrt
+from ._numerics import safe_sqrt
 from .anchor import Anchor, log_density, lost_drift_m, move_anchor, update_belief, votes
 from .attention import att_corr, att_rbf, attention, coherent_score, read_support
 from .background import Background, empty_background, is_background, remember, shows_rest
 from .motion import MotionMap, carry, empty_motion, push_gather
 from .parameters import physical, stored_log, stored_logit, with_physical
+from .phase_memory import PhaseMemory, carry_phases, phase_evidence
+from .phases import PhaseNoise
 from .propagation import log_likelihood_ratio, propagate, radio_speed, soft_clip, velocity_gate
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
 from .tracer import AbstractTracer, Camera, Frame, Trace, describe
-from .view import Grouping, View, elapsed_s, view_of
+from .view import Grouping, Ranging, View, elapsed_s, of_each_antenna, view_of
 
 SIGNIFICANCE = 1e-3
 """Share of the pixels by which the histogram rises at a corner of its CDF."""
@@ -58,6 +60,7 @@ class TagAttentionState(eqx.Module):
     place: Place
     anchor: Anchor
     background: Background
+    phases: PhaseMemory
 
 
 def paper_limit() -> dict[str, Any]:
@@ -76,6 +79,7 @@ def paper_limit() -> dict[str, Any]:
         "noise_share": nothing,
         "rest": 0.0,
         "coherent_weight": nothing,
+        "phase_weight": nothing,
         "v0_m_s": 0.1,
         "gate_width_m_s": 1e-6,
         "memory_s": 1e9,
@@ -108,6 +112,11 @@ class TagAttention(AbstractTracer):
     logit_rest: Float[Array, ""]
     log_coherent_weight: Float[Array, ""]
     coherent_level: Float[Array, ""]
+    log_phase_weight: Float[Array, ""]
+    log_phase_spread: Float[Array, ""]
+    log_phase_rest_spread: Float[Array, ""]
+    log_phase_slack: Float[Array, ""]
+    logit_phase_outlier: Float[Array, ""]
     log_v0: Float[Array, ""]
     log_gate_width: Float[Array, ""]
     log_memory: Float[Array, ""]
@@ -157,6 +166,11 @@ class TagAttention(AbstractTracer):
         rest: float = 0.9,
         coherent_weight: float = 2.0,
         coherent_level: float = 0.6,
+        phase_weight: float = 0.01,
+        phase_spread_rad: float = 0.07,
+        phase_rest_spread_rad: float = 0.03,
+        phase_slack: float = 0.2,
+        phase_outlier: float = 0.05,
         v0_m_s: float = 0.2,
         gate_width_m_s: float = 0.05,
         memory_s: float = 3.3,
@@ -203,6 +217,11 @@ class TagAttention(AbstractTracer):
             noise_share: share of the radio's variance that widens the kernel.
             rest: how much a pixel at rest counts as explained by the background; 0 in the paper.
             coherent_weight, coherent_level: weight of the coherent phase term, and the score that speaks for neither.
+            phase_weight: weight of the phase evidence (`tagjax.phases`), whose reads count once each.
+            phase_spread_rad, phase_rest_spread_rad: standard deviation of phases that a pixel's motion explains, and of
+                those of a tag at rest, beside thermal noise.
+            phase_slack, phase_outlier: share of the motion by which reflections bend phases; share of reads that say
+                nothing.
             v0_m_s, gate_width_m_s: velocity threshold (Eq. 7) and width of its soft step.
             memory_s: time in which evidence fades to 1/e while more comes in; infinite in the paper.
             evidence_limit: bound of the log odds.
@@ -238,6 +257,12 @@ class TagAttention(AbstractTracer):
         self.log_noise_share, self.logit_rest = stored_log(noise_share), stored_logit(rest)
         self.log_coherent_weight = stored_log(coherent_weight)
         self.coherent_level = jnp.asarray(coherent_level, jnp.float32)
+        self.log_phase_weight, self.log_phase_slack = stored_log(phase_weight), stored_log(phase_slack)
+        self.log_phase_spread, self.log_phase_rest_spread = (
+            stored_log(phase_spread_rad),
+            stored_log(phase_rest_spread_rad),
+        )
+        self.logit_phase_outlier = stored_logit(phase_outlier)
         self.log_v0, self.log_gate_width = stored_log(v0_m_s), stored_log(gate_width_m_s)
         self.log_memory, self.log_evidence_limit = stored_log(memory_s), stored_log(evidence_limit)
         self.logit_pool_motion, self.logit_pool_log_odds = stored_logit(pool_motion), stored_logit(pool_log_odds)
@@ -273,9 +298,9 @@ class TagAttention(AbstractTracer):
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         height, width = frame.depth_m.shape
-        num_tags, num_window = frame.radio.relative_m.shape
+        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
         return TagAttentionState(
-            motion=empty_motion(height, width, num_window),
+            motion=jax.vmap(lambda _: empty_motion(height, width, num_window))(camera.antennas_m),
             time_s=jnp.broadcast_to(frame.time_s, (num_window,)),
             log_odds=jnp.zeros((num_tags, height, width)),
             place=Place(
@@ -284,21 +309,27 @@ class TagAttention(AbstractTracer):
                 jnp.zeros(num_tags),
                 jnp.broadcast_to(jnp.exp(self.log_extent), (num_tags,)),
             ),
-            anchor=Anchor.unknown(num_tags, num_window, self.anchor_bins),
+            anchor=Anchor.unknown(num_tags, num_antennas, num_window=num_window, num_bins=self.anchor_bins),
             background=empty_background(num_tags, height, width),
+            phases=PhaseMemory.nothing(num_tags, num_antennas, height, width),
         )
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
         points = camera.rays * frame.depth_m[..., None]
         valid = frame.depth_m > 0
-        distance = jnp.where(valid, safe_norm(points - camera.antenna_m[None, None]), 0.0)
+        distances = jnp.where(valid[None], camera.ranges_m(points), 0.0)
+        distance = distances[0]
         time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
         # What shows the surface that has always been there has not moved, whatever shadow runs over it.
         rests = shows_rest(state.background, distance, valid)
         backward_px = jnp.where(rests[..., None], 0.0, frame.backward_px)
-        motion = push_gather(state.motion, backward_px, distance, self.max_speed_m_s * elapsed_s(time_s) + 0.05)
-        recent = motion.valid[..., -1] & motion.valid[..., -2]
-        step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
+        max_step_m = self.max_speed_m_s * elapsed_s(time_s) + 0.05
+        motion = of_each_antenna(
+            lambda one, distance_m: push_gather(one, backward_px, distance_m, max_step_m), state.motion, distances
+        )
+        followed = jnp.all(motion.valid[..., -2], axis=0)
+        recent = followed & valid
+        step_m = jnp.where(recent[None], motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
         grouping = Grouping(
             temperature=jnp.exp(self.log_segment_temperature),
             affinity_length=jnp.exp(self.log_affinity_length),
@@ -306,21 +337,25 @@ class TagAttention(AbstractTracer):
             pool_motion=jax.nn.sigmoid(self.logit_pool_motion),
             cell=self.cell,
         )
-        view = view_of(camera, points, distance, valid, motion, step_m, time_s, state.background, grouping)
+        view = view_of(camera, points, distances, valid, motion, step_m, time_s, state.background, grouping)
 
         moved = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), backward_px, jnp.zeros(())), -1, 0)
         # A surface that was hidden a frame ago brings no history of its own, but for what its pixel remembers.
         shows = is_background(state.background, distance, valid)
         recalled = jnp.where(shows[None], state.background.log_odds, 0.0)
-        carried = jnp.where((motion.valid[..., -2] | ~valid)[None], moved, recalled)
+        carried = jnp.where((followed | ~valid)[None], moved, recalled)
 
-        log_odds, mask, place, anchor = jax.vmap(self._trace_tag, in_axes=(None, 0, 0, 0, 0, 0))(
-            view, carried, frame.radio, frame.reads, state.place, state.anchor
+        phases = carry_phases(state.phases, backward_px, followed)
+
+        log_odds, mask, place, anchor, phases = jax.vmap(self._trace_tag, in_axes=(None, 0, 0, 0, 0, 0, 0))(
+            view, carried, frame.radio, frame.reads, state.place, state.anchor, phases
         )
         background = remember(state.background, distance, valid, log_odds)
         out = describe(mask, place.centre_m, step_m, recent, place.confidence, self.box_tail)
         # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
-        return TagAttentionState(motion, time_s, log_odds, jax.lax.stop_gradient(place), anchor, background), out
+        return TagAttentionState(
+            motion, time_s, log_odds, jax.lax.stop_gradient(place), anchor, background, phases
+        ), out
 
     def finish(self, state: TagAttentionState) -> TagAttentionState:
         return state
@@ -333,17 +368,19 @@ class TagAttention(AbstractTracer):
         reads: PhaseReads,
         place: Place,
         anchor: Anchor,
-    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"], Place, Anchor]:
-        """One tag's update: log odds, soft mask, place, anchor."""
+        phases: PhaseMemory,
+    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"], Place, Anchor, PhaseMemory]:
+        """One tag's update: log odds, soft mask, place, anchor, phases; radio, reads, anchor, phases per antenna."""
         valid = view.valid
-        evidence = self._evidence(view, radio, reads)
-        gate = self._gate(radio, view.time_s)
-        anchor = self._update_anchor(anchor, view, evidence, radio, gate)
-        near = log_density(
-            anchor, view.distance_m, jnp.exp(self.log_anchor_depth), jnp.exp(self.log_anchor_limit)
-        ) * valid.astype(evidence.dtype)
+        evidence, gate = self._weighed_evidence(view, radio, reads)
+        anchor, nears = of_each_antenna(
+            functools.partial(self._update_anchor, view, evidence), view.ranging, anchor, radio
+        )
+        near = jnp.sum(nears, axis=0)
         evidence = evidence + jnp.exp(self.log_anchor_rate) * near
         log_odds = propagate(carried, evidence, gate, jnp.exp(-view.elapsed_s / jnp.exp(self.log_memory)))
+        told, phases = of_each_antenna(functools.partial(self._phase_evidence, view), view.ranging, reads, phases)
+        log_odds = log_odds + jnp.sum(told, axis=0)
         log_odds = soft_clip(log_odds, jnp.exp(self.log_evidence_limit))
 
         share = jax.nn.sigmoid(self.logit_pool_log_odds)
@@ -372,7 +409,22 @@ class TagAttention(AbstractTracer):
         radius = safe_sqrt(jnp.sum(mask * away) / jnp.maximum(jnp.sum(mask), 1e-6))
         rate = jax.nn.sigmoid(self.logit_size_rate)
         held = jnp.where(confidence > 0.5, (1.0 - rate) * place.radius_m + rate * radius, place.radius_m)
-        return refined, mask, Place(centre, velocity, confidence, held), anchor
+        return refined, mask, Place(centre, velocity, confidence, held), anchor, phases
+
+    def _phase_evidence(
+        self, view: View, ranging: Ranging, reads: PhaseReads, phases: PhaseMemory
+    ) -> tuple[Float[Array, "height width"], PhaseMemory]:
+        """One antenna's evidence by the reads since the last frame, in units of the log odds."""
+        noise = PhaseNoise(
+            spread_rad2=jnp.exp(2.0 * self.log_phase_spread),
+            slack=jnp.exp(self.log_phase_slack),
+            outlier=jax.nn.sigmoid(self.logit_phase_outlier),
+        )
+        rest_spread_rad2 = jnp.exp(2.0 * self.log_phase_rest_spread)
+        told, phases = phase_evidence(
+            view, ranging, reads, phases, noise, rest_spread_rad2, doubled_angle=self.doubled_angle
+        )
+        return jnp.exp(self.log_phase_weight) * told, phases
 
     def _gate(self, radio: RadioWindow, time_s: Float[Array, " window"]) -> Float[Array, ""]:
         """The soft step of Eq. 7, closed as well where the radio knows less than the kernel asks."""
@@ -382,9 +434,25 @@ class TagAttention(AbstractTracer):
         gate = velocity_gate(speed, jnp.exp(self.log_v0), jnp.exp(self.log_gate_width))
         return gate * alpha / (alpha + uncertainty)
 
-    def _evidence(self, view: View, radio: RadioWindow, reads: PhaseReads) -> Float[Array, "height width"]:
-        """Log-likelihood ratio of object against background at each pixel: Eqs. 4-6 and the coherent phase term."""
-        everywhere = jnp.ones(view.rho.shape, dtype=bool)
+    def _weighed_evidence(
+        self, view: View, radio: RadioWindow, reads: PhaseReads
+    ) -> tuple[Float[Array, "height width"], Float[Array, ""]]:
+        """Evidence of all antennas, and the gate that it passes.
+
+        What antennas measure is independent, so their evidence adds up, each behind its own gate; the common gate, which
+        Eq. 7 forgets by, is the most open one, and the evidence is given relative to it.
+        """
+        gates = jax.vmap(self._gate, in_axes=(0, None))(radio, view.time_s)
+        each = of_each_antenna(functools.partial(self._evidence, view), view.ranging, radio, reads)
+        gate = jnp.max(gates)
+        return jnp.einsum("a,ahw->hw", gates / jnp.maximum(gate, 1e-6), each), gate
+
+    def _evidence(
+        self, view: View, ranging: Ranging, radio: RadioWindow, reads: PhaseReads
+    ) -> Float[Array, "height width"]:
+        """One antenna's log-likelihood ratio of object against background at each pixel: Eqs. 4-6 and coherence."""
+        rho = ranging.rho
+        everywhere = jnp.ones(rho.shape, dtype=bool)
         relative = radio.relative_m[None, None]
         profile = jax.nn.sigmoid(self.logit_profile)
         known_m = jnp.where(jnp.isfinite(radio.std_m), radio.std_m, 0.0)
@@ -395,12 +463,12 @@ class TagAttention(AbstractTracer):
             + jnp.exp(2.0 * self.log_slack) * travelled_m2
         )
         # The mean misfit over the window is profiled out: a single noisy first sample would offset all others.
-        offset = profile * jnp.mean(view.rho - relative, axis=-1, keepdims=True)
-        rbf = att_rbf(view.rho - offset, relative, everywhere, alpha[None, None])
-        corr = att_corr(view.rho, relative, everywhere)
+        offset = profile * jnp.mean(rho - relative, axis=-1, keepdims=True)
+        rbf = att_rbf(rho - offset, relative, everywhere, alpha[None, None])
+        corr = att_corr(rho, relative, everywhere)
         att = attention(rbf, corr, jax.nn.sigmoid(self.logit_beta))
         # What does not move at all needs no tag to explain it: at rest a pixel is background as far as it can be told.
-        still = view.rho - profile * jnp.mean(view.rho, axis=-1, keepdims=True)
+        still = rho - profile * jnp.mean(rho, axis=-1, keepdims=True)
         at_rest = att_rbf(still, jnp.zeros_like(relative), everywhere, alpha[None, None])
         level = jax.nn.sigmoid(self.logit_background)
         background = level + (1.0 - level) * jax.nn.sigmoid(self.logit_rest) * at_rest
@@ -408,34 +476,39 @@ class TagAttention(AbstractTracer):
         coherent_of = functools.partial(
             coherent_score, reads=reads, time_s=view.time_s, doubled_angle=self.doubled_angle
         )
-        score, score_at_rest = coherent_of(view.rho_segment), coherent_of(jnp.zeros((1, 1, view.rho.shape[-1])))
+        score, score_at_rest = coherent_of(ranging.rho_segment), coherent_of(jnp.zeros((1, 1, rho.shape[-1])))
         excess = jax.nn.relu(score_at_rest - self.coherent_level)
         beyond = score - self.coherent_level - jax.nn.sigmoid(self.logit_rest) * excess
         coherent = unpool(view.segments, beyond[..., None] * read_support(reads))[..., 0]
-        return jnp.where(view.known, ratio + jnp.exp(self.log_coherent_weight) * coherent, 0.0)
+        return jnp.where(ranging.known, ratio + jnp.exp(self.log_coherent_weight) * coherent, 0.0)
 
     def _update_anchor(
         self,
-        anchor: Anchor,
         view: View,
         evidence: Float[Array, "height width"],
+        ranging: Ranging,
+        anchor: Anchor,
         radio: RadioWindow,
-        gate: Float[Array, ""],
-    ) -> Anchor:
-        """Move the anchor with the radio, and let the segments that agree with the tag vote for its range."""
+    ) -> tuple[Anchor, Float[Array, "height width"]]:
+        """Move one antenna's anchor with its radio, let the segments that agree with the tag vote for its range.
+
+        Also the log density of what the anchor then believes, at each pixel's range.
+        """
         heard = jnp.all(jnp.isfinite(radio.std_m))
         drift = jnp.where(heard, jnp.exp(self.log_anchor_drift), lost_drift_m(view.time_s))
         anchor = move_anchor(anchor, radio.relative_m, heard, drift)
         told, _ = pool(view.segments, evidence[..., None], view.valid.astype(evidence.dtype))
         vote = votes(
             anchor,
-            view.segment_range_m.reshape(-1),
+            ranging.segment_range_m.reshape(-1),
             told.reshape(-1),
             view.segment_mass.reshape(-1) > 1.0,
             jnp.exp(self.log_anchor_width),
             self.anchor_unseen,
         )
-        return update_belief(anchor, vote, jnp.exp(self.log_anchor_weight) * gate)
+        anchor = update_belief(anchor, vote, jnp.exp(self.log_anchor_weight) * self._gate(radio, view.time_s))
+        near = log_density(anchor, ranging.distance_m, jnp.exp(self.log_anchor_depth), jnp.exp(self.log_anchor_limit))
+        return anchor, near * view.valid.astype(near.dtype)
 
     def _cut(
         self,

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._numerics import safe_norm
 from .attention import att_corr, att_rbf, attention, centre_first
 from .image.warp import splat
 from .motion import MotionMap, empty_motion, push_splat
@@ -45,7 +44,9 @@ class TagAttentionPaper(AbstractTracer):
 
     def init(self, camera: Camera, frame: Frame) -> PaperState:
         height, width = frame.depth_m.shape
-        num_tags, num_window = frame.radio.relative_m.shape
+        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
+        if num_antennas != 1:
+            raise ValueError(f"The paper's tracer knows one antenna; the clip has {num_antennas}. Set antennas to one.")
         return PaperState(
             motion=empty_motion(height, width, num_window),
             time_s=jnp.broadcast_to(frame.time_s, (num_window,)),
@@ -55,7 +56,7 @@ class TagAttentionPaper(AbstractTracer):
     def step(self, camera: Camera, state: PaperState, frame: Frame) -> tuple[PaperState, Trace]:
         points = camera.rays * frame.depth_m[..., None]
         valid = frame.depth_m > 0
-        distance = jnp.where(valid, safe_norm(points - camera.antenna_m[None, None]), 0.0)
+        distance = jnp.where(valid, camera.ranges_m(points)[0], 0.0)
         time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
         motion = push_splat(state.motion, frame.forward_px, distance)
         rho = centre_first(motion.distance_m, motion.valid)
@@ -68,13 +69,13 @@ class TagAttentionPaper(AbstractTracer):
         width = _HARD + self.softness
 
         def one_tag(carried, radio):
-            rd = radio.relative_m[None, None]
+            rd = radio.relative_m[:, None]
             att = attention(
                 att_rbf(rho, rd, motion.valid, self.alpha_m2[None, None]), att_corr(rho, rd, motion.valid), self.beta
             )
             evidence = log_likelihood_ratio(jnp.where(full, att, 0.0), jnp.ones(()), jnp.asarray(FLOOR))
             known = jnp.all(jnp.isfinite(radio.std_m))
-            gate = velocity_gate(radio_speed(radio.relative_m, time_s), self.v0_m_s, 0.1 * width)
+            gate = velocity_gate(radio_speed(radio.relative_m[0], time_s), self.v0_m_s, 0.1 * width)
             gate = gate * known.astype(gate.dtype)
             likelihood = propagate(carried, evidence, gate, self.forgetting)
             if self.refine:
@@ -88,7 +89,7 @@ class TagAttentionPaper(AbstractTracer):
         recent = motion.valid[..., -1] & motion.valid[..., -2]
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
         confidence = jnp.where(jnp.sum(mask, axis=(1, 2)) > 0, 1.0, 0.0)
-        trace = describe(mask, centre, step_m, recent, confidence, 0.0)
+        trace = describe(mask, centre, step_m[None], recent, confidence, 0.0)
         return PaperState(motion, time_s, likelihood), trace
 
     def finish(self, state: PaperState) -> PaperState:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
+from ._numerics import safe_norm
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import bounding_box
 
@@ -18,10 +19,16 @@ CLAIM = 0.505
 
 
 class Camera(eqx.Module):
-    """The camera at the working resolution, and the antenna beside it."""
+    """The camera at the working resolution, and the antennas around it."""
 
     rays: Float[Array, "height width 3"]  # ((x - cx) / fx, (y - cy) / fy, 1): point = depth * ray
-    antenna_m: Float[Array, " 3"]  # antenna position, camera frame
+    antennas_m: Float[Array, "antenna 3"]  # their places, camera frame
+
+    def ranges_m(self, points_m: Float[Array, "*batch 3"]) -> Float[Array, " antenna *batch"]:
+        """Distances of points in the camera frame to each antenna, metres."""
+        return jax.vmap(lambda antenna: safe_norm(points_m - jnp.broadcast_to(antenna, points_m.shape)))(
+            self.antennas_m
+        )
 
 
 class Frame(eqx.Module):
@@ -36,8 +43,8 @@ class Frame(eqx.Module):
     depth_m: Float[Array, "*time height width"]  # z, 0 = missing
     backward_px: Float[Array, "*time height width 2"]
     forward_px: Float[Array, "*time height width 2"]
-    radio: RadioWindow  # (*time, tag, window): causal, from reads up to this frame
-    reads: PhaseReads  # (*time, tag, read): the reads that fall into this frame's window
+    radio: RadioWindow  # (*time, tag, antenna, window): causal, from reads up to this frame
+    reads: PhaseReads  # (*time, tag, antenna, read): the reads that fall into this frame's window
     colour: UInt8[Array, "*time rows columns 3"] | None = None  # the whole picture, where flow is still to be computed
 
 
@@ -48,7 +55,7 @@ class Trace(eqx.Module):
     box_px: Float[Array, "*time tag 4"]  # x0 y0 x1 y1, inclusive pixel edges at the working resolution
     centre_px: Float[Array, "*time tag 2"]  # x y of the mask's centroid
     centre_m: Float[Array, "*time tag 3"]  # camera frame
-    step_m: Float[Array, "*time tag"]  # change of the object's distance to the antenna since the last frame
+    step_m: Float[Array, "*time tag antenna"]  # change of the object's distance to each antenna since the last frame
     confidence: Float[Array, "*time tag"]  # 0 to 1
     found: Bool[Array, "*time tag"]  # an object is claimed at all
 
@@ -79,12 +86,12 @@ def trace(tracer: AbstractTracer, camera: Camera, clip: Frame) -> Trace:
 def describe(
     mask: Float[Array, "tag height width"],
     centre_m: Float[Array, "tag 3"],
-    step_m: Float[Array, "height width"],
+    step_m: Float[Array, "antenna height width"],
     recent: Bool[Array, "height width"],
     confidence: Float[Array, " tag"],
     box_tail: float,
 ) -> Trace:
-    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distance."""
+    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distances."""
     hard = jnp.where(mask > 0.5, mask, 0.0)
     total = jnp.sum(hard, axis=(1, 2))
     height, width = mask.shape[1:]
@@ -92,7 +99,7 @@ def describe(
     x = jnp.sum(hard * jnp.arange(width, dtype=mask.dtype)[None, None], axis=(1, 2)) / divisor
     y = jnp.sum(hard * jnp.arange(height, dtype=mask.dtype)[None, :, None], axis=(1, 2)) / divisor
     moving = mask * recent.astype(mask.dtype)[None]
-    change = jnp.sum(moving * step_m[None], axis=(1, 2)) / jnp.maximum(jnp.sum(moving, axis=(1, 2)), 1e-6)
+    change = jnp.einsum("thw,ahw->ta", moving, step_m) / jnp.maximum(jnp.sum(moving, axis=(1, 2)), 1e-6)[:, None]
     return Trace(
         mask=mask,
         box_px=jax.vmap(lambda m: bounding_box(m, box_tail))(hard),

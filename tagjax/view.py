@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -11,6 +15,8 @@ from .background import Background, in_front
 from .motion import MotionMap
 from .segmentation import Segments, pool, segment, segment_affinity, unpool
 from .tracer import Camera
+
+T = TypeVar("T")
 
 
 class Grouping(eqx.Module):
@@ -23,25 +29,38 @@ class Grouping(eqx.Module):
     cell: int = eqx.field(static=True)
 
 
+class Ranging(eqx.Module):
+    """What one antenna would see of a frame: how far everything is, and how that has changed over the window."""
+
+    distance_m: Float[Array, "*antenna height width"]
+    rho: Float[Array, "*antenna height width window"]
+    known: Bool[Array, "*antenna height width"]
+    segment_range_m: Float[Array, "*antenna rows columns"]
+    rho_segment: Float[Array, "*antenna rows columns window"]
+
+
 class View(eqx.Module):
-    """One frame as all tags share it."""
+    """One frame as all tags share it; `ranging` has a leading axis of antennas."""
 
     points_m: Float[Array, "height width 3"]
-    distance_m: Float[Array, "height width"]
     valid: Bool[Array, "height width"]
     front: Float[Array, "height width"]
     time_s: Float[Array, " window"]
     segments: Segments
-    segment_range_m: Float[Array, "rows columns"]
     segment_mass: Float[Array, "rows columns"]
     affinity: Float[Array, "9 rows columns"]
-    rho: Float[Array, "height width window"]
-    known: Bool[Array, "height width"]
-    rho_segment: Float[Array, "rows columns window"]
+    ranging: Ranging
 
     @property
     def elapsed_s(self) -> Float[Array, ""]:
         return elapsed_s(self.time_s)
+
+
+def of_each_antenna(function: Callable[..., T], *parts: Any) -> T:
+    """What `function` makes of every antenna's part, stacked: written out, since antennas are few and batched gathers slow."""
+    num_antennas = jax.tree.leaves(parts)[0].shape[0]
+    each = [function(*jax.tree.map(lambda leaf, i=i: leaf[i], parts)) for i in range(num_antennas)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
 def elapsed_s(time_s: Float[Array, " window"]) -> Float[Array, ""]:
@@ -52,34 +71,35 @@ def elapsed_s(time_s: Float[Array, " window"]) -> Float[Array, ""]:
 def view_of(
     camera: Camera,
     points_m: Float[Array, "height width 3"],
-    distance_m: Float[Array, "height width"],
+    distance_m: Float[Array, "antenna height width"],
     valid: Bool[Array, "height width"],
     motion: MotionMap,
-    step_m: Float[Array, "height width"],
+    step_m: Float[Array, "antenna height width"],
     time_s: Float[Array, " window"],
     background: Background,
     grouping: Grouping,
 ) -> View:
-    """Segments, their motion, and what stands in front: once a frame, for all tags."""
-    features = _features(camera, points_m, valid, step_m, elapsed_s(time_s), grouping)
+    """Segments, their motion, and what stands in front: once a frame, for all tags.
+
+    The first antenna's distances serve where one will do: for the segments' motion, and for the background.
+    """
+    features = _features(camera, points_m, valid, step_m[0], elapsed_s(time_s), grouping)
     segments = segment(features, valid, grouping.temperature, cell=grouping.cell)
-    rho, known, rho_segment = _pooled_motion(segments, motion, grouping.pool_motion)
+    rho, known, rho_segment = of_each_antenna(lambda one: _pooled_motion(segments, one, grouping.pool_motion), motion)
     means, mass = pool(
-        segments, jnp.concatenate([features, distance_m[..., None]], axis=-1), valid.astype(points_m.dtype)
+        segments,
+        jnp.concatenate([features, jnp.moveaxis(distance_m, 0, -1)], axis=-1),
+        valid.astype(points_m.dtype),
     )
     return View(
         points_m=points_m,
-        distance_m=distance_m,
         valid=valid,
-        front=in_front(background, distance_m, valid),
+        front=in_front(background, distance_m[0], valid),
         time_s=time_s,
         segments=segments,
-        segment_range_m=means[..., 4],
         segment_mass=mass,
         affinity=segment_affinity(segments, means[..., :3], means[..., 3], grouping.affinity_length),
-        rho=rho,
-        known=known,
-        rho_segment=rho_segment,
+        ranging=Ranging(distance_m, rho, known, jnp.moveaxis(means[..., 4:], -1, 0), rho_segment),
     )
 
 

@@ -108,28 +108,30 @@ def load(recording: Recording, start: int, stop: int, *, epcs: Sequence[str] | N
     ranges = np.stack([truth.tag_range_m[epc] for epc in names], axis=1)
     window = np.clip(frames[:, None] + np.arange(-WINDOW + 1, 1), 0, None)
     relative = ranges[window] - ranges[window[:, :1]]
-    shape = (len(frames), len(names), MAX_READS)
+    shape = (len(frames), len(names), 1, MAX_READS)
     read_time, phase, valid = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
     for tag, epc in enumerate(names):
         own = recording.reads.select(epc)
         own_s = (own.time_ns - recording.time_ns[0]) * 1e-9
         for row, frame in enumerate(frames):
             inside = np.flatnonzero((own_s <= time_s[frame]) & (own_s >= time_s[window[row, 0]]))[-MAX_READS:]
-            read_time[row, tag, : len(inside)] = own_s[inside]
-            phase[row, tag, : len(inside)] = own.phase_rad[inside]
-            valid[row, tag, : len(inside)] = True
+            read_time[row, tag, 0, : len(inside)] = own_s[inside]
+            phase[row, tag, 0, : len(inside)] = own.phase_rad[inside]
+            valid[row, tag, 0, : len(inside)] = True
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     lens = recording.intrinsics
     rays = np.stack([(x - lens.cx_px) / lens.fx_px, (y - lens.cy_px) / lens.fy_px, np.ones_like(x)], axis=-1)
     single = lambda a: jnp.asarray(a, jnp.float32)  # noqa: E731
     return SyntheticClip(
-        Camera(single(rays), jnp.zeros(3)),
+        Camera(single(rays), jnp.zeros((1, 3))),
         Frame(
             time_s=single(time_s[frames]),
             depth_m=single(recording.depth_metres(slice(start, stop))),
             backward_px=jnp.zeros((len(frames), HEIGHT, WIDTH, 2)),
             forward_px=jnp.zeros((len(frames), HEIGHT, WIDTH, 2)),
-            radio=RadioWindow(single(np.moveaxis(relative, 1, 2)), jnp.full((len(frames), len(names), WINDOW), 0.005)),
+            radio=RadioWindow(
+                single(np.moveaxis(relative, 1, 2)[:, :, None]), jnp.full((len(frames), len(names), 1, WINDOW), 0.005)
+            ),
             reads=PhaseReads(
                 single(read_time),
                 single(phase),
@@ -158,7 +160,7 @@ class SmallTracer(AbstractTracer):
         self.level = jnp.asarray(level, jnp.float32)
 
     def init(self, camera: Camera, frame: Frame) -> SmallState:
-        num_tags, window = frame.radio.relative_m.shape
+        num_tags, _, window = frame.radio.relative_m.shape
         height, width = frame.depth_m.shape
         return SmallState(
             jnp.broadcast_to(frame.depth_m[..., None], (height, width, window)), jnp.zeros((num_tags, height, width))
@@ -167,7 +169,7 @@ class SmallTracer(AbstractTracer):
     def step(self, camera: Camera, state: SmallState, frame: Frame) -> tuple[SmallState, Trace]:
         distance = jnp.concatenate([state.distance_m[..., 1:], frame.depth_m[..., None]], axis=-1)
         rho = distance - distance[..., :1]
-        gap = jnp.sum(jnp.square(rho[None] - frame.radio.relative_m[:, None, None]), axis=-1)
+        gap = jnp.sum(jnp.square(rho[None] - frame.radio.relative_m[:, 0, None, None]), axis=-1)
         misfit = 0.9 * state.misfit + gap
         mask = jax.nn.sigmoid(self.level - jnp.exp(self.log_scale) * misfit)
         total = jnp.sum(mask, axis=(1, 2))
@@ -187,7 +189,7 @@ class SmallTracer(AbstractTracer):
             box_px=box,
             centre_px=0.5 * (box[:, :2] + box[:, 2:]),
             centre_m=jnp.zeros((num_tags, 3)),
-            step_m=jnp.sum(mask * change[None], axis=(1, 2)) / (total + 1e-6),
+            step_m=(jnp.sum(mask * change[None], axis=(1, 2)) / (total + 1e-6))[:, None],
             confidence=jnp.max(mask, axis=(1, 2)),
             found=jnp.any(mask > 0.5, axis=(1, 2)),
         )

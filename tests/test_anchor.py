@@ -14,7 +14,7 @@ WIDTH, UNSEEN = jnp.asarray(0.2), jnp.asarray(-1.0)
 
 
 def _fresh() -> Anchor:
-    return jax.tree.map(lambda leaf: leaf[0], Anchor.unknown(1, WINDOW, NUM_BINS))
+    return jax.tree.map(lambda leaf: leaf[0], Anchor.unknown(1, num_window=WINDOW, num_bins=NUM_BINS))
 
 
 def _windows(path: np.ndarray) -> np.ndarray:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
 from tagjax._numerics import SPEED_OF_LIGHT_M_S
-from tagjax.data.clips import choose_antenna, clip_dataset, load_clip
+from tagjax.data.clips import choose_antennas, clip_dataset, load_clip
 from tagjax.recording import Recording, RecordingError, RecordingWarning
 from tagjax.training.sources import join_reads
 
@@ -74,33 +76,60 @@ def test_only_the_antenna_with_the_most_reads_counts(recording: Recording) -> No
     both = _two_antennas(recording, 0.6)
     assert both.reads.antenna[0] == 2
     surplus = both.reads.num_reads - recording.reads.num_reads
-    with pytest.warns(RecordingWarning, match=rf"{surplus} of {both.reads.num_reads} reads left out .* to antenna 1,"):
+    with pytest.warns(RecordingWarning, match=rf"{surplus} of {both.reads.num_reads} reads left out .* to antenna 1\."):
         clip = load_clip(both, 4, 20, **SMALL)
-    np.testing.assert_array_equal(clip.camera.antenna_m, ANTENNAS_M[0])
+    np.testing.assert_array_equal(clip.camera.antennas_m, ANTENNAS_M[:1])
     _same_radio(clip, load_clip(recording, 4, 20, **SMALL))
     truth = np.diff(np.stack([recording.truth.tag_range_m[epc] for epc in clip.epcs], axis=1), axis=0)[3:]
     steps = np.asarray(clip.frames.radio.relative_m)
-    np.testing.assert_allclose((steps[..., -1] - steps[..., -2])[4:], truth[4:], atol=5e-3)
+    np.testing.assert_allclose((steps[:, :, 0, -1] - steps[:, :, 0, -2])[4:], truth[4:], atol=5e-3)
+
+
+def test_each_antenna_s_distances_are_those_that_it_alone_would_give(recording: Recording) -> None:
+    both = _two_antennas(recording, 0.9)
+    clip = load_clip(both, 4, 20, antennas="all", **SMALL)
+    np.testing.assert_allclose(clip.camera.antennas_m, ANTENNAS_M[:2], atol=1e-6)
+    for place in range(2):
+        with pytest.warns(RecordingWarning, match=rf"to antenna {place + 1}\. `antennas=all` uses every antenna"):
+            alone = load_clip(both, 4, 20, antennas=(place + 1,), **SMALL)
+        _same_radio(_of_antenna(clip, place), alone)
+
+
+def _of_antenna(clip, place: int):
+    """The clip with one antenna's radio and reads alone."""
+    of = lambda part: jax.tree.map(lambda leaf: leaf[:, :, place : place + 1], part)  # noqa: E731
+    frames = clip.frames
+    return eqx.tree_at(
+        lambda c: (c.frames.radio, c.frames.reads, c.camera.antennas_m),
+        clip,
+        (of(frames.radio), of(frames.reads), clip.camera.antennas_m[place : place + 1]),
+    )
 
 
 def test_a_named_antenna_is_obeyed(recording: Recording) -> None:
     both = _two_antennas(recording, 0.9)
-    with pytest.warns(RecordingWarning, match=f"{recording.reads.num_reads} of .* to antenna 2,"):
-        clip = load_clip(both, 4, 20, antenna=2, **SMALL)
-    np.testing.assert_allclose(clip.camera.antenna_m, ANTENNAS_M[1], atol=1e-6)
+    with pytest.warns(RecordingWarning, match=rf"{recording.reads.num_reads} of .* to antenna 2\."):
+        clip = load_clip(both, 4, 20, antennas=(2,), **SMALL)
+    np.testing.assert_allclose(clip.camera.antennas_m, ANTENNAS_M[1:2], atol=1e-6)
     truth = -np.diff(np.stack([recording.truth.tag_range_m[epc] for epc in clip.epcs], axis=1), axis=0)[3:]
     steps = np.asarray(clip.frames.radio.relative_m)
-    np.testing.assert_allclose((steps[..., -1] - steps[..., -2])[4:], truth[4:], atol=5e-3)
-    with pytest.warns(RecordingWarning, match="to antenna 2,"):
-        first = next(iter(clip_dataset([both], clip_length=6, seed=0, antenna=2, **SMALL)))
-    np.testing.assert_allclose(first.camera.antenna_m, ANTENNAS_M[1], atol=1e-6)
+    np.testing.assert_allclose((steps[:, :, 0, -1] - steps[:, :, 0, -2])[4:], truth[4:], atol=5e-3)
+    with pytest.warns(RecordingWarning, match=r"to antenna 2\."):
+        first = next(iter(clip_dataset([both], clip_length=6, seed=0, antennas=(2,), **SMALL)))
+    np.testing.assert_allclose(first.camera.antennas_m, ANTENNAS_M[1:2], atol=1e-6)
 
 
 @pytest.mark.parametrize("antenna", [0, 3, 4])
 def test_an_antenna_without_place_or_reads_is_refused(recording: Recording, antenna: int) -> None:
     both = _two_antennas(recording, 0.5)
-    with pytest.raises(RecordingError, match=rf"antenna {antenna} asked for; .*antennas 1 to 3.*of antenna 2"):
-        load_clip(both, 0, 6, antenna=antenna, **SMALL)
+    with pytest.raises(RecordingError, match=rf"antennas 1, {antenna} asked for; .*antennas 1 to 3.*of antenna 2"):
+        load_clip(both, 0, 6, antennas=(1, antenna), **SMALL)
+
+
+@pytest.mark.parametrize(("antennas", "said"), [((), "none"), ((1, 1), "1, 1")])
+def test_no_antenna_and_one_twice_are_refused(recording: Recording, antennas: tuple[int, ...], said: str) -> None:
+    with pytest.raises(RecordingError, match=f"antennas {said} asked for; .*each once"):
+        load_clip(_two_antennas(recording, 0.5), 0, 6, antennas=antennas, **SMALL)
 
 
 def test_antennas_without_place_are_passed_over(recording: Recording) -> None:
@@ -109,18 +138,18 @@ def test_antennas_without_place_are_passed_over(recording: Recording) -> None:
         load_clip(moved, 0, 6, **SMALL)
     both = _two_antennas(recording, 0.4)
     swapped = dataclasses.replace(both.reads, antenna=(3 - both.reads.antenna).astype(np.int16))  # most are now 2's
-    with pytest.warns(RecordingWarning, match="to antenna 1,"):
-        assert choose_antenna(dataclasses.replace(both, reads=swapped, antennas_m=ANTENNAS_M[:1]), ["tag-a"]) == 1
+    with pytest.warns(RecordingWarning, match=r"to antenna 1\."):
+        assert choose_antennas(dataclasses.replace(both, reads=swapped, antennas_m=ANTENNAS_M[:1]), ["tag-a"]) == (1,)
 
 
 def test_one_antenna_serves_all_tags_and_says_whom_it_does_not_read(recording: Recording) -> None:
     both = _two_antennas(recording, 1.0)
     apart = (both.reads.epc == "tag-b") == (both.reads.antenna == 2)  # tag-a by antenna 1 only, tag-b by antenna 2
     split = both.with_reads(both.reads[apart][:-20])  # as many reads of both: the first antenna
-    with pytest.warns(RecordingWarning, match="to antenna 1, .* Without any read are then: tag-b"):
+    with pytest.warns(RecordingWarning, match=r"to antenna 1\. .* Without any read are then: tag-b"):
         clip = load_clip(split, 0, 12, **SMALL)
     at = clip.epcs.index("tag-b")
-    np.testing.assert_array_equal(clip.camera.antenna_m, ANTENNAS_M[0])
+    np.testing.assert_array_equal(clip.camera.antennas_m, ANTENNAS_M[:1])
     assert np.isinf(np.asarray(clip.frames.radio.std_m)[:, at]).all()
     assert not np.asarray(clip.frames.reads.valid)[:, at].any()
     assert np.isfinite(np.asarray(clip.frames.radio.std_m)[-1, 1 - at]).all()
@@ -130,8 +159,8 @@ def test_reads_of_unknown_carrier_do_not_choose_the_antenna(recording: Recording
     both = _two_antennas(recording, 0.5)
     carrier = np.where(both.reads.antenna == 1, np.nan, both.reads.carrier_hz)
     unknown = both.with_reads(dataclasses.replace(both.reads, carrier_hz=carrier))
-    with pytest.warns(RecordingWarning, match="to antenna 2,"):
-        assert choose_antenna(unknown, unknown.reads.epcs) == 2
+    with pytest.warns(RecordingWarning, match=r"to antenna 2\."):
+        assert choose_antennas(unknown, unknown.reads.epcs) == (2,)
 
 
 def test_the_true_distances_may_stand_in_for_the_radio(recording: Recording) -> None:
@@ -142,7 +171,7 @@ def test_the_true_distances_may_stand_in_for_the_radio(recording: Recording) -> 
         for index in range(9):
             past = np.maximum(np.arange(index, index + 4), 0)
             np.testing.assert_allclose(
-                clip.frames.radio.relative_m[index, tag], range_m[past] - range_m[past[0]], atol=1e-5
+                clip.frames.radio.relative_m[index, tag, 0], range_m[past] - range_m[past[0]], atol=1e-5
             )
     assert np.isfinite(np.asarray(clip.frames.radio.std_m)).all()
     assert recording.truth is not None

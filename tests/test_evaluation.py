@@ -87,7 +87,7 @@ def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
             box_px=jnp.zeros((3, 4)),
             centre_px=jnp.zeros((3, 2)),
             centre_m=jnp.zeros((3, 3)),
-            step_m=jnp.zeros(3),
+            step_m=jnp.zeros((3, 1)),
             confidence=jnp.ones(3),
             found=jnp.array([True, False, claimed]),
         )

@@ -337,7 +337,7 @@ def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     pictures = jnp.asarray(np.stack([sample["clean"][:, :31] for sample in batch()]), jnp.float32) / 255
     shares = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings)[1]["hidden_share"])
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=False)[1]["hidden_share"])
         for step in (4, 5)
     ]
     assert shares[0] == pytest.approx(1 / 32)  # what leaves the picture
@@ -354,7 +354,7 @@ def test_teacher_is_heard_late_and_then_ramped() -> None:
     pictures = jnp.asarray(dark * np.asarray([1.0, 0.5], np.float32).reshape(1, 2, 1, 1, 1))
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     teaching = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings)[1]["teaching"])
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=True)[1]["teaching"])
         for step in (10, 15, 20, 40)
     ]
     # Backward, the student is two pixels off in one of two axes where the teacher is sure; forward it is right.

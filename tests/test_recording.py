@@ -463,7 +463,7 @@ def test_clips_hold_what_the_recording_holds(recording):
     np.testing.assert_allclose(clip.frames.depth_m[2], recording.depth[5, ::2, ::2])
     np.testing.assert_allclose(clip.frames.time_s, recording.frame_time_s()[3:9], rtol=1e-6)
     truth = recording.truth.tag_range_m["tag-b"]
-    relative = np.asarray(clip.frames.radio.relative_m)[-1, 1]
+    relative = np.asarray(clip.frames.radio.relative_m)[-1, 1, 0]
     np.testing.assert_allclose(relative, truth[5:9] - truth[5], atol=5e-3)
     # Past of a clip in the middle: the same radio as in the whole recording.
     whole = load_clip(recording, 0, 12, stride=2, window=4, max_reads=32)

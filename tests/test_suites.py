@@ -308,18 +308,21 @@ def test_things_do_not_pass_through_each_other(name, variant):
 
 
 def test_people_walk_as_fast_as_the_suite_says():
-    """All items: the asked speed is reached on the legs and kept there, and the object is never much faster."""
+    """All items: the asked speed is reached on the legs and kept there; what is traced is the person, with a badge."""
     for item in (suite := _named("speed")).items():
         filmed = stage_item(item)
         asked = item.variant.settings["speed_m_s"]
-        walker = _speed(filmed.world.bodies[next(iter(_bodies(filmed).values()))[0]].poses.position_m[:, :2])
-        carried = filmed.world.bodies[filmed.world.tags[0].body].poses.position_m
+        limbs = [filmed.world.bodies[i] for i in next(iter(_bodies(filmed).values()))]
+        assert {limb.label for limb in limbs} == {1}, item.name
+        walker = _speed(limbs[0].poses.position_m[:, :2])
+        (tag,) = filmed.world.tags
+        assert filmed.world.bodies[tag.body] in limbs, item.name
+        badge = tag_path(filmed.world, tag)
         assert walker.max() == pytest.approx(asked, rel=0.02), item.name
         assert np.mean(walker > 0.95 * asked) > 0.15, item.name
         assert np.percentile(walker, 75) > 0.75 * asked, item.name
-        assert _speed(carried).max() < 1.06 * asked, item.name
         # Both ways: towards the sensor and away.
-        rate = np.diff(np.linalg.norm(carried - np.array(filmed.camera_position_m), axis=1)) / STEP_S
+        rate = np.diff(np.linalg.norm(badge - np.array(filmed.camera_position_m), axis=1)) / STEP_S
         assert rate.min() < -0.7 * asked, item.name
         assert rate.max() > 0.6 * asked or suite.duration_s * asked < 3.5, item.name
 

@@ -11,10 +11,10 @@ import synthetic_clips as synthetic
 
 from tagjax.data.clips import load_clip
 from tagjax.motion import empty_motion, push_gather, push_splat
-from tagjax.rf.reads import RadioWindow
+from tagjax.rf.reads import PhaseReads, RadioWindow
 from tagjax.tagattention import TagAttention, paper_limit
 from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
-from tagjax.tracer import Frame, describe, trace
+from tagjax.tracer import Camera, Frame, describe, trace
 
 
 def _learnable():
@@ -52,19 +52,89 @@ def test_the_learnable_tracer_finds_both_objects(clip, said):
         assert bool(out.found[-1, tag])
 
 
+def test_phases_alone_name_both_objects(clip):
+    """Where the radio's distances are unknown, as between reads that are too few to unwrap, the raw phases still speak."""
+    unknown = eqx.tree_at(lambda f: f.radio.std_m, clip.frames, jnp.full_like(clip.frames.radio.std_m, jnp.inf))
+    tracer = TagAttention(cell=4, alpha_m2=1e-3, prior_weight=3.0, phase_weight=1.0)
+    spoken = eqx.filter_jit(trace)(tracer, clip.camera, unknown)
+    for tag, (x0, y0, x1, y1) in enumerate(synthetic.BOXES.values()):
+        covered = np.asarray(spoken.mask[-1, tag])
+        assert covered[y0 : y1 + 1, x0 : x1 + 1].mean() > 0.6
+        assert covered.sum() - covered[y0 : y1 + 1, x0 : x1 + 1].sum() < 0.3 * covered.sum()
+        assert float(spoken.confidence[-1, tag]) > 0.9
+
+
 def test_step_follows_the_objects_distance(clip, said):
     out = said
     time_s = np.asarray(clip.frames.time_s)
     for tag, label in enumerate(synthetic.BOXES):
         expected = np.diff(synthetic.offset_m(label, time_s))[-8:]
-        np.testing.assert_allclose(np.asarray(out.step_m[-8:, tag]), expected, atol=0.02)
+        np.testing.assert_allclose(np.asarray(out.step_m[-8:, tag, 0]), expected, atol=0.02)
 
 
-def test_tags_do_not_disturb_each_other(clip, said):
-    """Any number of tags by vmap: each is traced as if it were alone."""
+def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip, said):
+    """Any number of tags and antennas by vmap: each tag is traced as if it were alone, by what was heard of it."""
     alone = load_clip(synthetic.recording(24), 0, 24, stride=1, epcs=[clip.epcs[1]])
-    single = eqx.filter_jit(trace)(_learnable(), alone.camera, alone.frames)
+    frames = alone.frames
+    twice = lambda part: jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf], axis=2), part)  # noqa: E731
+    radio, reads = twice(frames.radio), twice(frames.reads)
+    deaf = eqx.tree_at(
+        lambda f: (f.radio, f.reads),
+        frames,
+        (
+            RadioWindow(radio.relative_m.at[:, :, 1].set(0.0), radio.std_m.at[:, :, 1].set(jnp.inf)),
+            eqx.tree_at(lambda r: r.valid, reads, reads.valid.at[:, :, 1].set(False)),
+        ),
+    )
+    camera = eqx.tree_at(lambda c: c.antennas_m, alone.camera, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5]]))
+    single = eqx.filter_jit(trace)(_learnable(), camera, deaf)
     np.testing.assert_allclose(said.mask[:, 1], single.mask[:, 0], atol=1e-4)
+    np.testing.assert_allclose(said.step_m[:, 1, 0], single.step_m[:, 0, 0], atol=1e-4)
+
+
+def _side_by_side() -> tuple[Camera, Frame, np.ndarray]:
+    """Two boxes that come and go alike, as far left of the middle as right; each carries a tag.
+
+    To an antenna in the middle both are always equally far; as one at the side sees it, one comes while the other goes.
+    """
+    height, width, num_window = 24, 32, 5
+    time_s = np.arange(24) / 10.0
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    rays = np.stack([(x - 15.5) / 20.0, (y - 11.5) / 20.0, np.ones_like(x)], axis=-1)
+    boxes = np.zeros((2, height, width), bool)
+    boxes[0, 6:18, 3:12] = boxes[1, 6:18, 20:29] = True
+    depth = np.full((len(time_s), height, width), 4.0)
+    depth[:, boxes.any(axis=0)] = (2.0 + 0.4 * np.cos(2.5 * time_s))[:, None]
+    antennas = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 2.0]])
+    ranges = np.linalg.norm(rays[None, None] * depth[None, ..., None] - antennas[:, None, None, None], axis=-1)
+    of_tag = np.stack([ranges[:, :, 12, 7], ranges[:, :, 12, 24]])  # tag, antenna, frame: at the middles
+    past = np.maximum(np.arange(len(time_s))[:, None] + np.arange(1 - num_window, 1), 0)
+    relative = np.moveaxis(of_tag[..., past] - of_tag[..., past[:, :1]], 2, 0)
+    np.testing.assert_allclose(relative[:, 0, 0], relative[:, 1, 0], atol=1e-12)
+    shape = (len(time_s), 2, 2, 4)
+    none = jnp.zeros(shape)
+    flow = jnp.zeros((len(time_s), height, width, 2))
+    return (
+        Camera(jnp.asarray(rays, jnp.float32), jnp.asarray(antennas, jnp.float32)),
+        Frame(
+            time_s=jnp.asarray(time_s, jnp.float32),
+            depth_m=jnp.asarray(depth, jnp.float32),
+            backward_px=flow,
+            forward_px=flow,
+            radio=RadioWindow(jnp.asarray(relative, jnp.float32), jnp.full(relative.shape, 0.005)),
+            reads=PhaseReads(none, none, none, none, jnp.zeros(shape, jnp.int32), jnp.zeros(shape, bool)),
+        ),
+        boxes,
+    )
+
+
+def test_a_second_antenna_splits_what_one_cannot():
+    camera, frames, boxes = _side_by_side()
+    mask = np.asarray(eqx.filter_jit(trace)(_learnable(), camera, frames).mask[-1]) > 0.5
+    for tag in range(2):
+        assert (mask[tag] & boxes[tag]).sum() / (mask[tag] | boxes[tag]).sum() > 0.6
+    with pytest.raises(ValueError, match=r"one antenna; the clip has 2"):
+        TagAttentionPaper().init(camera, jax.tree.map(lambda leaf: leaf[0], frames))
 
 
 @pytest.mark.slow
@@ -133,7 +203,7 @@ def test_paper_update_is_equation_7(clip):
     for t in range(10):
         state, _ = step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], frames))
         for tag in range(2):
-            rd = np.asarray(frames.radio.relative_m[t, tag])
+            rd = np.asarray(frames.radio.relative_m[t, tag, 0])
             speed = abs(rd[-1] - rd[0]) / float(frames.time_s[t] - frames.time_s[max(t - 4, 0)] + 1e-12)
             if not np.isfinite(np.asarray(frames.radio.std_m[t, tag])).all() or speed <= 0.1:
                 continue
@@ -240,9 +310,9 @@ def test_gathering_does_not_cross_a_depth_edge():
 def test_even_odds_are_no_claim():
     mask, nothing = jnp.ones((3, 4, 5)), jnp.zeros((3, 3))
     confidence = jnp.asarray([0.5, 0.503, 0.51])
-    out = describe(mask, nothing, jnp.zeros((4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
+    out = describe(mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
     assert out.found.tolist() == [False, False, True]
-    empty = describe(0.0 * mask, nothing, jnp.zeros((4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
+    empty = describe(0.0 * mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
     assert not empty.found.any()
 
 

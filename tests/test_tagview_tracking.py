@@ -357,7 +357,7 @@ def test_the_tracer_finds_names_and_places_every_tag():
     assert np.all(np.asarray(last.confidence) > 0.95)
     assert not np.asarray(said[0].found).any()
     ranges = [np.linalg.norm(recording.truth.tag_position_m["A"][i] - recording.antennas_m[0]) for i in (-2, -1)]
-    assert float(last.step_m[1]) == pytest.approx(ranges[1] - ranges[0], abs=0.012)
+    assert float(last.step_m[1, 0]) == pytest.approx(ranges[1] - ranges[0], abs=0.012)
 
 
 def test_a_known_height_places_tags_whatever_the_slope_says():

@@ -175,7 +175,7 @@ def test_the_system_finds_names_and_outlines_what_is_tagged(drawn: Recording, sa
             assert 0.5 < trace.confidence[tag] <= 1
     antenna = np.asarray(drawn.antennas_m[0])
     true_steps = np.diff(np.linalg.norm(drawn.truth.tag_position_m[scenes.EPCS[0]] - antenna, axis=1))[40:]
-    steps = np.array([trace.step_m[0] for number, trace in said if number >= 41])
+    steps = np.array([trace.step_m[0, 0] for number, trace in said if number >= 41])
     assert np.corrcoef(steps, true_steps)[0, 1] > 0.7
 
 
@@ -287,5 +287,5 @@ def test_claims_become_a_trace() -> None:
     assert trace.centre_px[0].tolist() == [4.5, 2.5]
     assert trace.box_px[3].tolist() == [0, 1, 2, 3]
     assert float(trace.confidence[2]) == 0.0
-    assert float(trace.step_m[3]) == pytest.approx(0.1)
+    assert float(trace.step_m[3, 0]) == pytest.approx(0.1)
     assert claims_to_trace([], (6, 8)).mask.shape == (0, 6, 8)

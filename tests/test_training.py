@@ -73,7 +73,7 @@ def _said_with_true_steps(clip: synthetic.SyntheticClip):
     seen = see(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
     time_s = np.asarray(clip.frames.time_s, np.float64)
     steps = np.stack([np.diff(synthetic.offset_m(label, time_s), prepend=0.0) for label in (1, 2)], axis=1)
-    return eqx.tree_at(lambda s: s.said.step_m, seen, jnp.asarray(steps, jnp.float32))
+    return eqx.tree_at(lambda s: s.said.step_m, seen, jnp.asarray(steps[..., None], jnp.float32))
 
 
 def test_true_motion_explains_own_reads_and_no_others() -> None:

@@ -165,4 +165,4 @@ def claims_to_trace(claims: Sequence[Claim | None], shape: tuple[int, int]) -> T
         place[tag], step[tag], confidence[tag], found[tag] = claim.centre_m, claim.step_m, claim.confidence, True
     # Masks are large and read on the host: they stay there even if an accelerator is the default.
     with jax.default_device(jax.devices("cpu")[0]):
-        return Trace(*(jnp.asarray(x) for x in (mask, box, centre, place, step, confidence, found)))
+        return Trace(*(jnp.asarray(x) for x in (mask, box, centre, place, step[:, None], confidence, found)))

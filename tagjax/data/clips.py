@@ -15,13 +15,16 @@ import numpy as np
 from ..geometry import pixel_rays, range_to_depth
 from ..recording import Recording, RecordingError, RecordingWarning
 from ..rf.reads import PhaseReads, RadioWindow
-from ..rf.windows import phase_reads, radio_windows, window_reads
+from ..rf.windows import host_reads, radio_windows, window_reads
 from ..tracer import Camera, Frame
 from .flow_cache import pair_flow
 from .stream import Stream
 
 Estimator = Literal["robust", "paper", "truth"]
 """Of the tags' distances; `truth` takes those of a simulated recording, to tell what the radio costs."""
+
+Antennas = tuple[int, ...] | Literal["all"] | None
+"""Which antennas' reads are used, counted from 1; None is the one with the most."""
 
 _TRUTH_STD_M = 1e-3
 
@@ -48,41 +51,44 @@ def check_clip(*, stride: int = 1, window: int = 2, max_reads: int = 1) -> None:
             raise ValueError(f"{name} is {found}; expected at least {least} ({meaning}).")
 
 
-def choose_antenna(recording: Recording, epcs: Sequence[str], antenna: int | None = None) -> int:
-    """The antenna (counted from 1) that distances are to: the given one, or the one with the most reads of the tags.
+def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antennas = None) -> tuple[int, ...]:
+    """The antennas (counted from 1) that distances are to: the given ones, all, or the one with the most reads (None).
 
-    Only antennas that `antennas_m` places count, and reads of known carrier before others; of equals the first. It is
-    one antenna for all tags, since pixels have one distance. Warns (`RecordingWarning`) of the reads that the other
-    antennas made, which are of no use then. Raises `RecordingError` where no antenna is left.
+    All are those that `antennas_m` places and that have read one of the tags; with None, reads of known carrier count
+    before others, and of equals the first antenna. Warns (`RecordingWarning`) of the reads that are of no use then.
+    Raises `RecordingError` where no antenna is left.
     """
     reads = recording.reads[np.isin(recording.reads.epc, list(epcs))]
     ports, counts = np.unique(reads.antenna, return_counts=True)
     made = ", ".join(f"{count} of antenna {port}" for port, count in zip(ports, counts, strict=True)) or "none"
     num_placed = len(recording.antennas_m)
-    if antenna is None:
-        placed = [int(port) for port in ports if 1 <= port <= num_placed]
+    placed = tuple(int(port) for port in ports if 1 <= port <= num_placed)
+    if antennas is None or antennas == "all":
         if not placed:
             raise RecordingError(
                 f"{recording.name}: reads: {made}; antennas_m places antennas 1 to {num_placed}. Give all places."
             )
         told = np.isfinite(reads.carrier_hz)
-        antenna = max(placed, key=lambda p: (np.sum(told & (reads.antenna == p)), np.sum(reads.antenna == p)))
-    elif not 1 <= antenna <= num_placed or antenna not in ports:
-        raise RecordingError(
-            f"{recording.name}: antenna {antenna} asked for; antennas_m places antennas 1 to {num_placed}, and the tags' "
-            f"reads are: {made}. Choose an antenna that has both."
-        )
-    others = int(np.sum(reads.antenna != antenna))
-    if others:
-        unread = [epc for epc in epcs if not np.any((reads.epc == epc) & (reads.antenna == antenna))]
+        most = max(placed, key=lambda p: (np.sum(told & (reads.antenna == p)), np.sum(reads.antenna == p)))
+        chosen = placed if antennas == "all" else (most,)
+    else:
+        chosen = antennas
+        if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(placed):
+            raise RecordingError(
+                f"{recording.name}: antennas {', '.join(map(str, chosen)) or 'none'} asked for; antennas_m places antennas 1 to "
+                f"{num_placed}, and the tags' reads are: {made}. Choose antennas that have both, each once."
+            )
+    used = np.isin(reads.antenna, chosen)
+    if not used.all():
+        unread = [epc for epc in epcs if not np.any((reads.epc == epc) & used)]
         warnings.warn(
-            f"{recording.name}: {others} of {reads.num_reads} reads left out (reads: {made}): distances are to antenna "
-            f"{antenna}, and another antenna's say nothing of them."
+            f"{recording.name}: {np.sum(~used)} of {reads.num_reads} reads left out (reads: {made}): distances are to "
+            f"antenna {', '.join(map(str, chosen))}. `antennas=all` uses every antenna that is placed."
             + (f" Without any read are then: {', '.join(unread)}." if unread else ""),
             RecordingWarning,
             stacklevel=3,
         )
-    return antenna
+    return chosen
 
 
 def _thin_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
@@ -109,14 +115,14 @@ def load_clip(
     window: int = 5,
     max_reads: int = 64,
     estimator: Estimator = "robust",
-    antenna: int | None = None,
+    antennas: Antennas = None,
     colour: bool = False,
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
     `stride` keeps every n-th pixel in both directions. The radio is estimated from the recording's start, causally, so
-    that a clip in the middle knows its past. Distances are to one antenna, and the radio uses that antenna's
-    reads only (see `choose_antenna`). With `colour` the clip holds its pictures, and zero in place of the flow, which is
+    that a clip in the middle knows its past. `antennas` says whose reads are used and to where distances
+    are (see `choose_antennas`). With `colour` the clip holds its pictures, and zero in place of the flow, which is
     then a network's to make. Raises `RecordingError` for an unknown EPC or antenna and `ValueError` for frames outside
     the recording or settings that no clip can have.
     """
@@ -126,7 +132,7 @@ def load_clip(
     named = tuple(recording.resolve_epcs(epcs))
     if not named:
         raise RecordingError(f"{recording.name} holds no tag read: there is nothing to trace.")
-    antenna = choose_antenna(recording, named, antenna)
+    chosen = choose_antennas(recording, named, antennas)
     intrinsics = recording.intrinsics.scaled(stride)
     depth = recording.depth_metres(slice(start, stop))
     if recording.depth_kind == "range":
@@ -139,32 +145,35 @@ def load_clip(
             ways[:, ::stride, ::stride] / np.float32(stride) for ways in pair_flow(recording, start, stop, flow)
         )
     time_s = jnp.asarray(recording.frame_time_s(), jnp.float32)
-    heard = recording.reads.antenna == antenna
-    longest = max(int(np.sum((recording.reads.epc == epc) & heard)) for epc in named)
-    length = max(256, -(-longest // 256) * 256)
+    counts = [np.sum((recording.reads.epc == epc) & (recording.reads.antenna == a)) for epc in named for a in chosen]
+    length = max(256, -(-int(max(counts)) // 256) * 256)
     origin_ns = int(recording.time_ns[0])
-    buffers = [phase_reads(recording.reads, epc, origin_ns, length=length, antenna=antenna) for epc in named]
-    if estimator == "truth":
-        radio = [_true_window(recording, epc, window, antenna) for epc in named]
-    else:
-        radio = [radio_windows(reads, time_s, window, estimator) for reads in buffers]
-    reads = [_window(reads, time_s, window, max_reads) for reads in buffers]
 
-    def per_tag(parts):
-        return jax.tree.map(lambda *leaves: jnp.stack([leaf[start:stop] for leaf in leaves], axis=1), *parts)
+    def heard(epc: str, antenna: int) -> tuple[RadioWindow, PhaseReads]:
+        buffer = host_reads(recording.reads, epc, origin_ns, length=length, antenna=antenna)
+        if estimator == "truth":
+            radio = _true_window(recording, epc, window, antenna)
+        else:
+            radio = radio_windows(buffer, time_s, window, estimator)
+        held = radio, _window_reads(buffer, time_s, window, max_reads)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[start:stop], held)
 
+    def stacked(parts):
+        return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *parts)
+
+    radio, reads = jax.tree.map(jnp.asarray, stacked([stacked([heard(e, a) for a in chosen]) for e in named]))
     return Clip(
         camera=Camera(
             rays=jnp.asarray(pixel_rays(intrinsics)),
-            antenna_m=jnp.asarray(recording.antennas_m[antenna - 1], jnp.float32),
+            antennas_m=jnp.asarray(recording.antennas_m[np.array(chosen) - 1], jnp.float32),
         ),
         frames=Frame(
             time_s=time_s[start:stop],
             depth_m=jnp.asarray(depth),
             backward_px=jnp.asarray(backward),
             forward_px=jnp.asarray(forward),
-            radio=per_tag(radio),
-            reads=per_tag(reads),
+            radio=radio,
+            reads=reads,
             colour=jnp.asarray(recording.colour[start:stop]) if colour else None,
         ),
         epcs=named,
@@ -180,7 +189,7 @@ def _true_window(recording: Recording, epc: str, num_window: int, antenna: int) 
     if antenna != 1:
         raise RecordingError(
             f"{recording.name}: estimator=truth, but true ranges are to antenna 1 and the clip's are to antenna {antenna}. "
-            "Set antenna=1."
+            "Set antennas=[1]."
         )
     if truth is None or epc not in truth.tag_range_m:
         there = ", ".join(truth.tag_range_m) if truth is not None else ""
@@ -198,11 +207,7 @@ def _true_window(recording: Recording, epc: str, num_window: int, antenna: int) 
     )
 
 
-def _window(reads: PhaseReads, time_s: jax.Array, num_window: int, max_reads: int) -> PhaseReads:
-    return _window_jit(reads, time_s, num_window, max_reads)
-
-
-_window_jit = jax.jit(window_reads, static_argnums=(2, 3))
+_window_reads = jax.jit(window_reads, static_argnums=(2, 3))
 
 
 class _ClipSource:
@@ -247,7 +252,7 @@ def clip_dataset(
     window: int = 5,
     max_reads: int = 64,
     estimator: Estimator = "robust",
-    antenna: int | None = None,
+    antennas: Antennas = None,
     colour: bool = False,
     step: int | None = None,
     workers: int = 0,
@@ -275,7 +280,7 @@ def clip_dataset(
         window=window,
         max_reads=max_reads,
         estimator=estimator,
-        antenna=antenna,
+        antennas=antennas,
         colour=colour,
     )
     dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()

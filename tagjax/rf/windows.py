@@ -30,10 +30,10 @@ _PAST_KNOTS = 3
 _PAST_SPACING_S = 0.1
 
 
-def phase_reads(
+def host_reads(
     reads: TagReads, epc: str, origin_ns: int, *, length: int | None = None, antenna: int | None = None
 ) -> PhaseReads:
-    """The reads of one tag as a device buffer; times in seconds from `origin_ns`.
+    """The reads of one tag as a buffer of NumPy arrays; times in seconds from `origin_ns`.
 
     Reads of unknown carrier are left out, and those of other antennas than `antenna` (counted from 1) if it is given:
     a path is the distance to one place, so reads of several antennas are no path. The length is padded to a multiple of 256 unless given, so that tags and
@@ -48,10 +48,10 @@ def phase_reads(
     pairs, channel = np.unique(np.stack([own.antenna, own.carrier_hz]), axis=1, return_inverse=True)
     del pairs
 
-    def padded(column: np.ndarray, fill: float | int, dtype: type) -> Array:
+    def padded(column: np.ndarray, fill: float | int, dtype: type) -> Any:
         out = np.full(size, fill, dtype)
         out[:count] = column
-        return jnp.asarray(out)
+        return out
 
     last = float((own.time_ns[-1] - origin_ns) * 1e-9) if count else 0.0
     return PhaseReads(
@@ -62,6 +62,13 @@ def phase_reads(
         channel=padded(channel.reshape(-1), -1, np.int32),
         valid=padded(np.ones(count), 0.0, np.bool_),
     )
+
+
+def phase_reads(
+    reads: TagReads, epc: str, origin_ns: int, *, length: int | None = None, antenna: int | None = None
+) -> PhaseReads:
+    """`host_reads` on the device."""
+    return jax.tree.map(jnp.asarray, host_reads(reads, epc, origin_ns, length=length, antenna=antenna))
 
 
 def radio_model(reads: PhaseReads, **settings: float) -> RadioModel:

@@ -13,7 +13,7 @@ from ._rotation import turn_about
 from .inventory import InventorySettings
 from .motion import Walk, num_steps, random_walks, still_then_move, walk_along, wave
 from .objects import ObjectModel, make_object
-from .people import Hands, PersonModel, PersonMotion, hold, limb_bodies, make_person, move_person
+from .people import Hands, PersonModel, PersonMotion, badge_m, hold, limb_bodies, make_person, move_person
 from .record import Filmed
 from .rooms import Room
 from .virtual_tag import default_epc
@@ -33,11 +33,20 @@ class StageSet:
         self.tags: list[Tag] = []
         self.names: dict[int, str] = {}
 
-    def person(self, model: PersonModel, walk: Walk, hands: Hands) -> PersonMotion:
-        """Put a person on a walk; what comes back says where the hands really are."""
+    def person(self, model: PersonModel, walk: Walk, hands: Hands, *, badge: bool = False) -> PersonMotion:
+        """Put a person on a walk; what comes back says where the hands really are.
+
+        With a `badge` the person wears a tag on the chest and is labelled: it is the person that is to be traced.
+        """
         number = len({body.name for body in self.bodies if body.role == "person"})
-        motion = move_person(model, walk, hands)
-        self.bodies += limb_bodies(model, motion, name=f"person {number + 1}")
+        name, motion = f"person {number + 1}", move_person(model, walk, hands)
+        label = len(self.names) + 1 if badge else 0
+        limbs = limb_bodies(model, motion, label=label, name=name)
+        if badge:
+            self.names[label] = name
+            torso = len(self.bodies) + list(motion.limbs).index("torso")
+            self.tags.append(Tag(default_epc(len(self.tags) + 1), torso, badge_m(model), (0.0, 1.0, 0.0)))
+        self.bodies += limbs
         return motion
 
     def object(self, model: ObjectModel, poses: Poses, *, tagged: bool = True, labelled: bool = True) -> None:

@@ -23,11 +23,12 @@ def approach(
     duration_s: float,
     *,
     room: str = "meeting_room",
-    kind: str = "bag",
+    kind: str | None = None,
     speed_m_s: float = 0.8,
 ) -> Filmed:
-    """A person walks towards the sensor and away again, round and round, an object in the right hand.
+    """A person walks towards the sensor and away again, round and round, a badge on the chest.
 
+    With a `kind` it is an object of that kind, in the right hand, that is tagged and labelled instead of the person.
     Straight legs are walked at `speed_m_s` once it is reached; the narrow turns at the ends, to the right, are slower,
     and the object, on their inner side, never moves faster than the person does on the legs.
     """
@@ -40,9 +41,13 @@ def approach(
     laps = int(np.ceil(speed_m_s * duration_s / (2 * (far - near)))) + 1
     path = path_through(_loops(near, far, y, laps), speed_m_s=speed_m_s, max_acceleration_m_s2=push)
     walk = trimmed(walk_along(path), stage.steps)
-    person, model = make_person(rng), make_object(kind, rng)
-    motion = stage.person(person, walk, Hands(right=hold(walk, (0.26, -0.16, 1.0))))
-    stage.object(model, carried(motion.right_hand, model.grip_m))
+    person = make_person(rng)
+    if kind is None:
+        stage.person(person, walk, Hands(), badge=True)
+    else:
+        model = make_object(kind, rng)
+        motion = stage.person(person, walk, Hands(right=hold(walk, (0.26, -0.16, 1.0))))
+        stage.object(model, carried(motion.right_hand, model.grip_m))
     return stage.filmed(f"a person walks to and fro at {speed_m_s} m/s", look_at_m=((near + far) / 2, 0.5 * y, 0.95))
 
 

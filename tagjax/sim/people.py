@@ -125,6 +125,13 @@ def limb_bodies(model: PersonModel, motion: PersonMotion, *, label: int = 0, nam
     return tuple(Body(name, shapes[limb], poses, "person", label) for limb, poses in motion.limbs.items())
 
 
+def badge_m(model: PersonModel) -> tuple[float, float, float]:
+    """Where a badge hangs, in the torso's frame: before the middle of the chest, a centimetre clear of the shirt."""
+    chest = limb_shapes(model)["torso"][1]
+    x, y, z = chest.position_m
+    return x + chest.size_m[0] + 0.01, y, z
+
+
 def hand_path(model: PersonModel, walk: Walk, hands: Hands | None = None, side: Side = "right") -> Poses:
     """Where a hand's grip really is, after blending and clamping, and how it is turned.
 

@@ -94,21 +94,16 @@ def batch_loss(
     seen: Float[Array, "batch 2 height width 3"],
     step: Int[Array, ""],
     settings: FlowLossSettings,
+    *,
+    teach: bool,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Mean loss over a batch, and its terms. Pictures are 0 to 1."""
+    """Mean loss over a batch, and its terms. Pictures are 0 to 1; `teach` once the teacher has begun."""
     hide = (step >= settings.occlusion_after).astype(jnp.float32)
-
-    def terms(teach: bool) -> dict[str, Array]:
-        one = jax.vmap(lambda c, s: pair_terms(network, c, s, hide, settings, teach=teach))
-        return jax.tree.map(jnp.mean, one(clean, seen))
-
-    if settings.self_supervision > 0:
-        begun = (step - settings.self_supervision_after).astype(jnp.float32)
-        ramp = jnp.clip(begun / max(settings.self_supervision_ramp, 1), 0.0, 1.0)
-        found = jax.lax.cond(ramp > 0, lambda: terms(True), lambda: terms(False))
-        found["teaching"] = ramp * found["teaching"]
-    else:
-        found = terms(False)
+    one = jax.vmap(lambda c, s: pair_terms(network, c, s, hide, settings, teach=teach))
+    found = jax.tree.map(jnp.mean, one(clean, seen))
+    begun = (step - settings.self_supervision_after).astype(jnp.float32)
+    ramp = jnp.clip(begun / max(settings.self_supervision_ramp, 1), 0.0, 1.0)
+    found["teaching"] = ramp * found["teaching"]
     return weighted(found, settings), found
 
 
@@ -119,12 +114,13 @@ def _update(
     optimizer: optax.GradientTransformation,
     settings: FlowLossSettings,
     average_over: float,
+    teach: bool,
 ) -> tuple[FlowTrainState, dict[str, Array]]:
     clean, seen = (picture.astype(jnp.float32) / 255 for picture in pictures)
     learnable, rest = eqx.partition(state.network, eqx.is_inexact_array)
 
     def loss(learnable: PyTree) -> tuple[Array, dict[str, Array]]:
-        return batch_loss(eqx.combine(learnable, rest), clean, seen, state.step, settings)
+        return batch_loss(eqx.combine(learnable, rest), clean, seen, state.step, settings, teach=teach)
 
     (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(learnable)
     norm = optax.tree.norm(gradient)
@@ -165,5 +161,7 @@ def flow_step(
         raise ValueError("A training step needs at least one pair.")
     check_batch(len(samples) * jax.process_count())
     clean, seen = (spread(jnp.asarray(np.stack([sample[name] for sample in samples]))) for name in ("clean", "seen"))
-    state, numbers = _update((clean, seen), copied(state), optimizer, settings, average_over)
+    # Chosen here, not by a condition on the device: inside one, XLA's CPU backend takes ten times as long a step.
+    teach = settings.self_supervision > 0 and int(state.step) > settings.self_supervision_after
+    state, numbers = _update((clean, seen), copied(state), optimizer, settings, average_over, teach)
     return state, {name: float(value) for name, value in numbers.items()}

@@ -40,6 +40,10 @@ class JointModel(eqx.Module):
     loss: FlowLossSettings = eqx.field(static=True)
 
 
+PAIRS_AT_ONCE = 4
+"""Pairs of pictures whose flow is computed together: the last group may be smaller, and is then compiled by itself."""
+
+
 def network_flow(
     network: AbstractFlowNetwork, frames: Frame, settings: FlowLossSettings
 ) -> tuple[Flow, Float[Array, ""], dict[str, Float[Array, ""]]]:
@@ -52,7 +56,6 @@ def network_flow(
         raise ValueError("The clip holds no pictures; load it with colour=True to compute flow from them.")
     stride = _stride(frames)
 
-    @eqx.filter_checkpoint
     def pair(network: AbstractFlowNetwork, one: UInt8[Array, "_ _ 3"], other: UInt8[Array, "_ _ 3"]):
         height, width, _ = one.shape
         sides = [padding(size, network.divisor) for size in (height, width)]
@@ -71,9 +74,12 @@ def network_flow(
         ways = working(forward[-1], *pictures), working(backward[-1], *pictures[::-1])
         return ways, terms
 
-    (forward, backward), terms = jax.lax.map(
-        lambda pictures: pair(network, *pictures), (frames.colour[:-1], frames.colour[1:])
-    )
+    # In turn, so that memory holds the activations of a few; but not by `lax.map`: in a loop XLA's CPU backend takes
+    # twelve times as long over convolutions.
+    several = eqx.filter_checkpoint(eqx.filter_vmap(pair, in_axes=(None, 0, 0)))
+    places = [slice(i, i + PAIRS_AT_ONCE) for i in range(0, len(frames.colour) - 1, PAIRS_AT_ONCE)]
+    done = [several(network, frames.colour[:-1][place], frames.colour[1:][place]) for place in places]
+    (forward, backward), terms = jax.tree.map(lambda *parts: jnp.concatenate(parts), *done)
     first = jnp.zeros_like(forward[:1])
     terms = jax.tree.map(jnp.mean, terms)
     flow = Flow(*(jnp.concatenate([first, way]) for way in (forward, backward)))

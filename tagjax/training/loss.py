@@ -7,6 +7,7 @@ unwrapped, and no label is used. Each term is a function of a `Seen` clip; `TERM
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._numerics import safe_divide, safe_norm
+from .._numerics import safe_divide
 from ..rf.coherence import coherence, phase_residual
 from ..rf.reads import PhaseReads
 from ..tracer import AbstractTracer, Camera, Frame, Trace, trace
@@ -56,7 +57,7 @@ class Seen(eqx.Module):
     camera: Camera
     frames: Frame
     said: Trace
-    reads: PhaseReads  # (tag, reads): each read of the clip once
+    reads: PhaseReads  # (tag, antenna, reads): each read of the clip once
 
 
 class _Trained(AbstractTracer):
@@ -95,14 +96,14 @@ def see(tracer: AbstractTracer, camera: Camera, frames: Frame, settings: Objecti
 
 
 def clip_reads(frames: Frame, settings: ObjectiveSettings) -> PhaseReads:
-    """Each tag's reads of the whole clip, (tag, reads), from the overlapping windows of its frames.
+    """Each tag's reads of the whole clip by each antenna, (tag, antenna, reads), from the overlapping windows of its frames.
 
     Of a frame's window only what came after the frame before is new. Channels are numbered anew by first appearance
     and cut at `num_channels`; of more than `max_reads` reads the newest stay.
     """
-    before = jnp.concatenate([frames.time_s[:1], frames.time_s[:-1]])
+    before = jnp.concatenate([frames.time_s[:1], frames.time_s[:-1]])[:, None, None, None]
     reads = frames.reads
-    new = reads.valid & (reads.time_s > before[:, None, None]) & (reads.time_s <= frames.time_s[:, None, None])
+    new = reads.valid & (reads.time_s > before) & (reads.time_s <= frames.time_s[:, None, None, None])
     reads = eqx.tree_at(lambda r: r.valid, reads, new)
 
     def pack(one: PhaseReads) -> PhaseReads:
@@ -113,7 +114,7 @@ def clip_reads(frames: Frame, settings: ObjectiveSettings) -> PhaseReads:
         keep = packed.valid & (number < settings.num_channels)
         return eqx.tree_at(lambda r: (r.channel, r.valid), packed, (jnp.where(keep, number, 0), keep))
 
-    return jax.vmap(pack)(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), reads))
+    return jax.vmap(jax.vmap(pack))(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 2), reads))
 
 
 def _number_channels(channel: Int[Array, " reads"], valid: Bool[Array, " reads"]) -> Int[Array, " reads"]:
@@ -131,21 +132,23 @@ def distance_at(
     return jnp.interp(query_s, frame_time_s, distance)
 
 
-def _pieces(seen: Seen, settings: ObjectiveSettings) -> Bool[Array, "piece tag reads"]:
+def _pieces(
+    frame_time_s: Float[Array, " time"], reads: PhaseReads, settings: ObjectiveSettings
+) -> Bool[Array, "tag piece reads"]:
     """Which reads belong to which piece of the clip; pieces overlap by half."""
-    num_frames = seen.frames.time_s.shape[0]
+    num_frames = frame_time_s.shape[0]
     span = min(settings.span_frames, num_frames - 1)
     skip = min(settings.skip_frames, num_frames - 1 - span)
     starts = jnp.arange(skip, num_frames - span, max(span // 2, 1))
-    begin, end = seen.frames.time_s[starts], seen.frames.time_s[starts + span]
-    time_s = seen.reads.time_s[None]
-    inside = (time_s > begin[:, None, None]) & (time_s <= end[:, None, None]) & seen.reads.valid[None]
+    begin, end = frame_time_s[starts][None, :, None], frame_time_s[starts + span][None, :, None]
+    time_s = reads.time_s[:, None]
+    inside = (time_s > begin) & (time_s <= end) & reads.valid[:, None]
     enough = jnp.sum(inside, axis=-1, keepdims=True) >= settings.min_reads
     return inside & enough
 
 
 class Agreement(eqx.Module):
-    """Coherence of each tag's reads with candidate motions, per piece of the clip."""
+    """Coherence of each tag's reads with candidate motions, per piece of the clip; pieces of all antennas in a row."""
 
     between: Float[Array, "reads_of motion_of piece"]  # reads of one tag with the motion of another's mask
     altered: Float[Array, "tag candidate piece"]  # own reads with altered own motion
@@ -154,14 +157,29 @@ class Agreement(eqx.Module):
 
 
 def agreement(seen: Seen, settings: ObjectiveSettings, key: Array) -> Agreement:
-    """Hold every tag's reads against its own mask's motion, the other masks', time-shifted and mirrored ones."""
-    time_s, reads = seen.frames.time_s, seen.reads
-    steps = seen.said.step_m.T
+    """Hold every tag's reads against its own mask's motion, the other masks', time-shifted and mirrored ones.
+
+    Each antenna's reads are held against the distances to that antenna.
+    """
+    of_antenna = functools.partial(_agreement_of_antenna, frame_time_s=seen.frames.time_s, settings=settings, key=key)
+    each = jax.vmap(of_antenna, in_axes=(1, 2), out_axes=-2)(seen.reads, seen.said.step_m)
+    return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], -1), each)
+
+
+def _agreement_of_antenna(
+    reads: PhaseReads,
+    step_m: Float[Array, "time tag"],
+    *,
+    frame_time_s: Float[Array, " time"],
+    settings: ObjectiveSettings,
+    key: Array,
+) -> Agreement:
+    steps = step_m.T
     num_tags, num_frames = steps.shape
-    inside = jnp.moveaxis(_pieces(seen, settings), 0, 1)
+    inside = _pieces(frame_time_s, reads, settings)
 
     def score(one: PhaseReads, member: Bool[Array, "piece reads"], step_m: Float[Array, " time"]) -> Array:
-        residual = phase_residual(one.phase_rad, one.carrier_hz, distance_at(step_m, time_s, one.time_s))
+        residual = phase_residual(one.phase_rad, one.carrier_hz, distance_at(step_m, frame_time_s, one.time_s))
         weight = member.astype(residual.dtype) / (jnp.square(one.sigma_rad) + 0.1)[None]
         return coherence(
             jnp.broadcast_to(residual, weight.shape),
@@ -243,11 +261,11 @@ def future_agreement(
     if num_frames < num_window:
         raise ValueError(f"A clip of {num_frames} frames is too short for the window of {num_window}; lengthen it.")
     stride = settings.future_stride
-    distance = safe_norm(camera.rays[None] * frames.depth_m[..., None] - camera.antenna_m[None, None, None])
-    distance = jnp.where(frames.depth_m > 0, distance, 0.0)
+    ranges = camera.ranges_m(camera.rays[None] * frames.depth_m[..., None])
+    ranges = jnp.where(frames.depth_m[None] > 0, ranges, 0.0)
     rows, columns = jnp.meshgrid(jnp.arange(0, height, stride), jnp.arange(0, width, stride), indexing="ij")
 
-    def follow(start: Int[Array, ""]) -> tuple[Array, Array]:
+    def follow(distance: Float[Array, "time height width"], start: Int[Array, ""]) -> tuple[Array, Array]:
         x, y = columns.astype(distance.dtype), rows.astype(distance.dtype)
         at = distance[start][rows, columns]
         valid, values = at > 0, [at]
@@ -262,17 +280,21 @@ def future_agreement(
             values.append(at)
         return jnp.stack(values, axis=-1), valid
 
-    followed, valid = jax.vmap(follow)(jnp.arange(num_asked))
+    over_time = jax.vmap(follow, in_axes=(None, 0))
+    followed, valid = jax.vmap(over_time, in_axes=(0, None), out_axes=1)(ranges, jnp.arange(num_asked))
+    valid = jnp.all(valid, axis=1)
     centred = followed - jnp.mean(followed, axis=-1, keepdims=True)
     radio = jax.tree.map(lambda leaf: leaf[num_window - 1 :], frames.radio)
     known = jnp.all(jnp.isfinite(radio.std_m), axis=-1)
     tag = jnp.where(known[..., None], radio.relative_m, 0.0)
     tag = tag - jnp.mean(tag, axis=-1, keepdims=True)
     spread = settings.future_alpha_m2 + jnp.where(known, jnp.mean(jnp.square(radio.std_m), axis=-1), 0.0)
-    misfit = jnp.mean(jnp.square(centred[:, None] - tag[:, :, None, None]), axis=-1)
-    agrees = jnp.exp(-misfit / (2.0 * spread[..., None, None]))
-    resting = jnp.exp(-jnp.mean(jnp.square(tag), axis=-1) / (2.0 * spread))
-    weight = jnp.where(known, 1.0 - resting, 0.0)
+    misfit = jnp.mean(jnp.square(centred[:, None] - tag[:, :, :, None, None]), axis=-1)
+    # An antenna that has not heard the tag says nothing; the others' errors are independent.
+    told = jnp.where(known, 1.0 / (2.0 * spread), 0.0)
+    agrees = jnp.exp(-jnp.sum(misfit * told[..., None, None], axis=2))
+    resting = jnp.exp(-jnp.sum(jnp.mean(jnp.square(tag), axis=-1) * told, axis=-1))
+    weight = jnp.where(jnp.any(known, axis=-1), 1.0 - resting, 0.0)
     beyond = safe_divide(
         jax.nn.relu(agrees - resting[..., None, None]), jnp.broadcast_to(weight[..., None, None], agrees.shape)
     )
