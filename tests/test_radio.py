@@ -14,7 +14,7 @@ from scipy.interpolate import lagrange
 from tagjax.recording import TagReads
 from tagjax.rf.channels import estimate_slope
 from tagjax.rf.coherence import coherence, phase_residual
-from tagjax.rf.grid_filter import RadioModel, filter_reads, reference_carrier
+from tagjax.rf.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
 from tagjax.rf.noise import pi_flip_share, thermal_sigma_rad
 from tagjax.rf.phase import distance_to_phase, phase_to_distance
 from tagjax.rf.reads import PhaseReads
@@ -142,6 +142,21 @@ def test_coherence_gradient_agrees_with_finite_differences(gradients_agree):
     channel = jnp.asarray(rng.integers(0, 3, 20))
     weight = rng.uniform(0.5, 1, 20)
     gradients_agree(lambda r, w: coherence(r, w, channel, num_channels=3, multiple=2), (rng.uniform(0, 6, 20), weight))
+
+
+@pytest.mark.parametrize("size", [8, 9, 48])
+def test_the_circle_s_transform_is_numpy_s_and_its_inverse_undoes_it(size):
+    values = np.random.default_rng(0).normal(size=(size, 3))
+    forward, back = _fourier(size)
+    cosine, sine = np.split(forward @ values, 2)
+    np.testing.assert_allclose(cosine - 1j * sine, np.fft.rfft(values, axis=0), atol=1e-12)
+    np.testing.assert_allclose(back @ forward @ values, values, atol=1e-12)
+
+
+def test_the_filter_asks_xla_for_no_fft():
+    """XLA's waits on its own threads: the tests hung in one run of three."""
+    reads = phase_reads(simulate_reads(np.random.default_rng(0), lambda t: 2 + 0.7 * t, 2.0), "A", 0)
+    assert "fft" not in jax.jit(filter_reads).lower(reads, RadioModel()).as_text()
 
 
 def test_filter_follows_a_clean_ramp_through_flips_and_hops():

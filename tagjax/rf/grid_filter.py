@@ -51,6 +51,18 @@ def level_phase(reads: PhaseReads, model: RadioModel, reference_hz: Float[Array,
     return reads.phase_rad - model.slope_rad_hz * (reads.carrier_hz - reference_hz)
 
 
+def _fourier(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The real Fourier transform of `size` values, cosine parts before sine parts, and its inverse, as matrices.
+
+    At this size products take no longer than a fast transform, which in a loop on few cores can wait for ever: XLA's (jaxlib
+    0.10) waits on a thread of the pool that its own threads come from.
+    """
+    turns = 2 * np.pi / size * np.outer(np.arange(size // 2 + 1), np.arange(size))
+    forward = np.concatenate([np.cos(turns), np.sin(turns)])
+    weight = np.where(2 * np.arange(size // 2 + 1) % size == 0, 1.0, 2.0) / size
+    return forward, (forward * np.concatenate([weight, weight])[:, None]).T
+
+
 def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
     """Run the filter over reads in order of time; invalid reads repeat the value before them.
 
@@ -65,6 +77,7 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
     spacing = 2 * model.max_speed_m_s / (num_velocities - 1)
     theta = jnp.arange(num_phases, dtype=dtype) * (2 * np.pi / num_phases)
     harmonic = jnp.arange(num_phases // 2 + 1, dtype=dtype)
+    to_harmonics, from_harmonics = (jnp.asarray(matrix, dtype) for matrix in _fourier(num_phases))
     # Eigenbasis of the reflecting diffusion on the velocity grid: cosines.
     k = np.arange(num_velocities)
     cosines = np.cos(np.pi * k[:, None] * (k[None, :] + 0.5) / num_velocities)
@@ -80,12 +93,12 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
         belief, distance, last_time, last_channel, started = carry
         time, angle, carrier, concentration, channel, valid = read
         gap = jnp.where(started, jnp.maximum(time - last_time, 0.0), 0.0)
-        turned = jnp.fft.rfft(belief, axis=0)
-        turned_by = harmonic[:, None] * (wavenumber * gap * velocity)[None, :]
-        turn = jax.lax.complex(jnp.cos(turned_by), -jnp.sin(turned_by))
+        cosine, sine = jnp.split(to_harmonics @ belief, 2)
+        turn = harmonic[:, None] * (wavenumber * gap * velocity)[None, :]
         blur = jnp.where((channel != last_channel) & started, model.hop_rad, 0.0)
         damp = jnp.exp(-0.5 * jnp.square(harmonic * blur))[:, None]
-        predicted = jnp.fft.irfft(turned * turn * damp.astype(turned.dtype), n=num_phases, axis=0)
+        along, across = damp * jnp.cos(turn), damp * jnp.sin(turn)
+        predicted = from_harmonics @ jnp.concatenate([cosine * along - sine * across, sine * along + cosine * across])
         spread = jnp.exp(-0.5 * model.velocity_walk_m2_s3 * gap * decay)
         predicted = jnp.maximum(((predicted @ basis.T) * spread[None, :]) @ basis, 0.0) + 1e-9
         mean_velocity = jnp.sum(predicted * velocity[None, :]) / jnp.sum(predicted)
