@@ -8,6 +8,8 @@ It extends the matching of TagAttention (Eqs. 4-6) from a window of frames to al
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -34,8 +36,7 @@ class Anchor(eqx.Module):
     @classmethod
     def unknown(cls, *batch: int, num_window: int, num_bins: int) -> Anchor:
         """Nothing travelled, nothing known."""
-        uniform = -jnp.log(jnp.asarray(float(num_bins)))
-        return cls(jnp.zeros((*batch, num_window)), jnp.full((*batch, num_bins), uniform))
+        return cls(jnp.zeros((*batch, num_window)), jnp.full((*batch, num_bins), -math.log(num_bins), float))
 
 
 def _start_m(anchor: Anchor) -> Float[Array, " bins"]:

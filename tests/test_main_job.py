@@ -37,9 +37,10 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 def _values(recordings: list[str]) -> dict:
     return {
-        "tracer": {"_target_": "tagjax.tagattention.TagAttention", "cell": 4},
+        # Softened, the paper's tracer has parameters to learn, too, and compiles in a third of the time.
+        "tracer": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},
-        "baselines": {"paper": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4}},
+        "baselines": {"learnable": {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}},
         "data": {
             "recordings": recordings[:1],
             "validation": recordings[1:],
@@ -57,7 +58,7 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
     score = run_training(from_mapping(TrainConfig, values), tmp_path)
     assert 0.0 <= score <= 1.0
     summary = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(summary) == {"learned", "untrained", "paper"}
+    assert set(summary) == {"learned", "untrained", "learnable"}
     assert summary["learned"]["all"]["iou"] == pytest.approx(score)
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 2]
@@ -68,7 +69,7 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
 
     config = from_mapping(EvaluateConfig, {"run": str(tmp_path), "recordings": recordings[1:], "progress": False})
     again = run_evaluation(config, tmp_path / "again", run_values={**values, "scores": {}})
-    assert set(again) == {"learned", "paper"}
+    assert set(again) == {"learned", "learnable"}
     part = from_mapping(
         EvaluateConfig, {"run": str(tmp_path), "frames": [0, 9], "baselines": {}, "stride": 8, "progress": False}
     )

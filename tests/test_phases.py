@@ -199,6 +199,7 @@ def test_gradients_are_those_of_finite_differences():
     with jax.enable_x64(True):
         phasor, fresh = _some(jnp.float64)
 
+        @jax.jit
         def told(values):
             start, step, spread, slack, outlier = values[:3], values[3], values[4], values[5], values[6]
             noise = PhaseNoise(spread, slack, outlier)
@@ -206,7 +207,7 @@ def test_gradients_are_those_of_finite_differences():
             return value + 0.1 * jnp.sum(after.total) + after.moved_m
 
         at = jnp.concatenate([phasor.total, phasor.moved_m[None], jnp.asarray([0.013, 0.01, 0.2, 0.05])])
-        gradient = jax.grad(told)(at)
+        gradient = jax.jit(jax.grad(told))(at)
         for i in range(len(at)):
             h = 1e-6
             change = (told(at.at[i].add(h)) - told(at.at[i].add(-h))) / (2 * h)
@@ -223,7 +224,7 @@ def test_gradients_are_finite_from_nothing(silent):
         value, after = explain(phasor, step, fresh, _noise(), doubled_angle=True)
         return value + jnp.sum(after.total)
 
-    gradient = jax.grad(told, argnums=(0, 1))(Phasor.nothing(()), jnp.asarray(0.0))
+    gradient = jax.jit(jax.grad(told, argnums=(0, 1)))(Phasor.nothing(()), jnp.asarray(0.0))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 

@@ -12,16 +12,20 @@ from radio_simulation import C, simulate_reads, smooth_path
 from scipy.interpolate import lagrange
 
 from tagjax.recording import TagReads
+from tagjax.rf import refine, resample
 from tagjax.rf.channels import estimate_slope
 from tagjax.rf.coherence import coherence, phase_residual
 from tagjax.rf.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
 from tagjax.rf.noise import pi_flip_share, thermal_sigma_rad
 from tagjax.rf.phase import distance_to_phase, phase_to_distance
 from tagjax.rf.reads import PhaseReads
-from tagjax.rf.refine import interpolation_weights, refine_path
-from tagjax.rf.resample import resample_polynomial
+from tagjax.rf.refine import interpolation_weights
 from tagjax.rf.unwrap import remove_jump, unwrap_paper
 from tagjax.rf.windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
+
+# Compiled whole: operation by operation they take several times as long to compile.
+refine_path = eqx.filter_jit(refine.refine_path)
+resample_polynomial = jax.jit(resample.resample_polynomial)
 
 
 def _steps(window, truth):

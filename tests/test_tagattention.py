@@ -151,6 +151,17 @@ def test_scan_is_the_loop_of_steps(clip):
     assert jax.tree.map(jnp.shape, tracer.finish(state)) == shapes
 
 
+@pytest.mark.parametrize("tracer", [_learnable(), TagAttentionPaper(cell=4)])
+def test_a_step_gives_back_the_state_that_it_takes(clip, tracer):
+    """In shape and type, weak or not: else the second frame of a recording compiles the step once more."""
+    first = jax.tree.map(lambda leaf: leaf[0], clip.frames)
+    taken = jax.eval_shape(tracer.init, clip.camera, first)
+    given, _ = jax.eval_shape(tracer.step, clip.camera, taken, first)
+    assert jax.tree.structure(given) == jax.tree.structure(taken)
+    for one, other in zip(jax.tree.leaves(given), jax.tree.leaves(taken), strict=True):
+        assert (one.shape, one.dtype, one.weak_type) == (other.shape, other.dtype, other.weak_type)
+
+
 @eqx.filter_jit
 @functools.partial(eqx.filter_value_and_grad, has_aux=True)
 def _total_and_gradient(tracer, camera, frames):

@@ -5,7 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tagjax.image.warp import gather, splat
+from tagjax.image import warp
+
+gather, splat = jax.jit(warp.gather), jax.jit(warp.splat)
 
 
 def _smooth(shape, seed=0):
@@ -90,6 +92,6 @@ def test_gradients_agree_with_finite_differences(gradients_agree):
 def test_jit_and_vmap_change_nothing():
     images = jnp.stack([jnp.asarray(_smooth((6, 7, 2), seed)) for seed in range(3)])
     flows = jnp.stack([jnp.asarray(_smooth((6, 7, 2), 10 + seed)) for seed in range(3)])
-    for warp in (gather, splat):
-        looped = jnp.stack([warp(im, f)[0] for im, f in zip(images, flows, strict=True)])
-        np.testing.assert_allclose(jax.jit(jax.vmap(warp))(images, flows)[0], looped, atol=1e-6)
+    for way in (gather, splat):
+        looped = jnp.stack([way(im, f)[0] for im, f in zip(images, flows, strict=True)])
+        np.testing.assert_allclose(jax.jit(jax.vmap(way))(images, flows)[0], looped, atol=1e-6)
