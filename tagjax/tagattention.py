@@ -18,7 +18,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ._numerics import safe_sqrt
 from .anchor import Anchor, log_density, lost_drift_m, move_anchor, update_belief, votes
@@ -31,7 +31,7 @@ from .phases import PhaseNoise
 from .propagation import log_likelihood_ratio, propagate, radio_speed, soft_clip, velocity_gate
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
-from .tracer import AbstractTracer, Camera, Frame, Trace, claims, describe
+from .tracer import AbstractTracer, Camera, Frame, Trace, describe
 from .view import Grouping, Ranging, View, elapsed_s, of_each_antenna, view_of
 
 SIGNIFICANCE = 1e-3
@@ -49,7 +49,6 @@ class Place(eqx.Module):
     velocity_m_s: Float[Array, "*tag 3"]
     confidence: Float[Array, "*tag"]
     radius_m: Float[Array, "*tag"]  # root mean square distance of its points from the centre
-    claimed: Bool[Array, "*tag"]
 
 
 class TagAttentionState(eqx.Module):
@@ -309,7 +308,6 @@ class TagAttention(AbstractTracer):
                 jnp.zeros((num_tags, 3)),
                 jnp.zeros(num_tags),
                 jnp.broadcast_to(jnp.exp(self.log_extent), (num_tags,)),
-                jnp.zeros(num_tags, bool),
             ),
             anchor=Anchor.unknown(num_tags, num_antennas, num_window=num_window, num_bins=self.anchor_bins),
             background=empty_background(num_tags, height, width),
@@ -353,7 +351,7 @@ class TagAttention(AbstractTracer):
             view, carried, frame.radio, frame.reads, state.place, state.anchor, phases
         )
         background = remember(state.background, distance, valid, log_odds)
-        out = describe(mask, place.centre_m, step_m, recent, place.confidence, place.claimed, self.box_tail)
+        out = describe(mask, place.centre_m, step_m, recent, place.confidence, self.box_tail)
         # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
         return TagAttentionState(
             motion, time_s, log_odds, jax.lax.stop_gradient(place), anchor, background, phases
@@ -411,8 +409,7 @@ class TagAttention(AbstractTracer):
         radius = safe_sqrt(jnp.sum(mask * away) / jnp.maximum(jnp.sum(mask), 1e-6))
         rate = jax.nn.sigmoid(self.logit_size_rate)
         held = jnp.where(confidence > 0.5, (1.0 - rate) * place.radius_m + rate * radius, place.radius_m)
-        claimed = claims(confidence, place.claimed)
-        return refined, mask, Place(centre, velocity, confidence, held, claimed), anchor, phases
+        return refined, mask, Place(centre, velocity, confidence, held), anchor, phases
 
     def _phase_evidence(
         self, view: View, ranging: Ranging, reads: PhaseReads, phases: PhaseMemory

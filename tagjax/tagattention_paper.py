@@ -16,7 +16,7 @@ from .image.warp import splat
 from .motion import MotionMap, empty_motion, push_splat
 from .propagation import log_likelihood_ratio, propagate, radio_speed, velocity_gate
 from .segmentation import cdf_cut, pool, segment, unpool
-from .tracer import CLAIM, AbstractTracer, Camera, Frame, Trace, describe
+from .tracer import AbstractTracer, Camera, Frame, Trace, describe
 
 FLOOR = 1e-6
 SIGNIFICANCE = 1e-3
@@ -89,7 +89,7 @@ class TagAttentionPaper(AbstractTracer):
         recent = motion.valid[..., -1] & motion.valid[..., -2]
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
         confidence = jnp.where(jnp.sum(mask, axis=(1, 2)) > 0, 1.0, 0.0)
-        trace = describe(mask, centre, step_m[None], recent, confidence, confidence > CLAIM, 0.0)
+        trace = describe(mask, centre, step_m[None], recent, confidence, 0.0)
         return PaperState(motion, time_s, likelihood), trace
 
     def finish(self, state: PaperState) -> PaperState:

@@ -15,10 +15,7 @@ from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import bounding_box
 
 CLAIM = 0.505
-"""A claim lasts while the confidence is above this: what rests stays within half a percent of even odds."""
-
-CLAIM_ONSET = 0.63
-"""A claim begins at more confidence than this, which what rests hardly ever reaches for a moment."""
+"""A claim takes more confidence than this: what rests stays within half a percent of even odds, where nothing speaks for one."""
 
 
 class Camera(eqx.Module):
@@ -86,24 +83,15 @@ def trace(tracer: AbstractTracer, camera: Camera, clip: Frame) -> Trace:
     return out
 
 
-def claims(confidence: Float[Array, "*tag"], before: Bool[Array, "*tag"]) -> Bool[Array, "*tag"]:
-    """Whether each tag's object is claimed to be where the mask is, given whether it was a frame ago."""
-    return confidence > jnp.where(before, CLAIM, CLAIM_ONSET)
-
-
 def describe(
     mask: Float[Array, "tag height width"],
     centre_m: Float[Array, "tag 3"],
     step_m: Float[Array, "antenna height width"],
     recent: Bool[Array, "height width"],
     confidence: Float[Array, " tag"],
-    claimed: Bool[Array, " tag"],
     box_tail: float,
 ) -> Trace:
-    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distances.
-
-    What is claimed counts as found, unless its mask is empty.
-    """
+    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distances."""
     hard = jnp.where(mask > 0.5, mask, 0.0)
     total = jnp.sum(hard, axis=(1, 2))
     height, width = mask.shape[1:]
@@ -119,5 +107,5 @@ def describe(
         centre_m=centre_m,
         step_m=change,
         confidence=confidence,
-        found=claimed & (total > 0),
+        found=(confidence > CLAIM) & (total > 0),
     )

@@ -14,7 +14,7 @@ from tagjax.motion import empty_motion, push_gather, push_splat
 from tagjax.rf.reads import PhaseReads, RadioWindow
 from tagjax.tagattention import TagAttention, paper_limit
 from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
-from tagjax.tracer import Camera, Frame, claims, describe, trace
+from tagjax.tracer import Camera, Frame, describe, trace
 
 
 def _learnable():
@@ -321,19 +321,10 @@ def test_gathering_does_not_cross_a_depth_edge():
 def test_even_odds_are_no_claim():
     mask, nothing = jnp.ones((3, 4, 5)), jnp.zeros((3, 3))
     confidence = jnp.asarray([0.5, 0.503, 0.51])
-    claimed = claims(confidence, jnp.ones(3, bool))
-    out = describe(mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, claimed, 0.0)
+    out = describe(mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
     assert out.found.tolist() == [False, False, True]
-    empty = describe(0.0 * mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, claimed, 0.0)
+    empty = describe(0.0 * mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
     assert not empty.found.any()
-
-
-def test_a_claim_begins_at_more_than_it_lasts_with():
-    confidence = jnp.asarray([0.5, 0.6, 0.64, 0.6, 0.503, 0.6])
-    claimed = [jnp.asarray(False)]
-    for each in confidence:
-        claimed.append(claims(each, claimed[-1]))
-    assert [bool(each) for each in claimed[1:]] == [False, False, True, True, False, False]
 
 
 def test_only_frames_and_reads_enter(clip):
