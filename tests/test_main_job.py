@@ -37,7 +37,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 def _values(recordings: list[str]) -> dict:
     return {
-        # Softened, the paper's tracer has parameters to learn, too, and compiles in a third of the time.
+        # Softened, the paper's tracer has parameters to learn, too; with it the test takes half as long.
         "tracer": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},
         "baselines": {"learnable": {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}},

@@ -158,7 +158,7 @@ def test_the_circle_s_transform_is_numpy_s_and_its_inverse_undoes_it(size):
 
 
 def test_the_filter_asks_xla_for_no_fft():
-    """XLA's waits on its own threads: the tests hung in one run of three."""
+    """XLA's may wait on its own threads for ever; the tests hung where this filter's result was awaited."""
     reads = phase_reads(simulate_reads(np.random.default_rng(0), lambda t: 2 + 0.7 * t, 2.0), "A", 0)
     assert "fft" not in jax.jit(filter_reads).lower(reads, RadioModel()).as_text()
 
