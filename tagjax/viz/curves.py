@@ -42,10 +42,11 @@ def score_curves(
             zorder=0,
         )
         axes.grid(alpha=0.3)
-    upper.set(ylabel="box IoU", ylim=(-0.02, 1.02), title=title)
+    upper.set(ylabel="box IoU", ylim=(-0.02, 1.02))
+    upper.set_title(title, loc="left", fontsize=10)
     lower.set(ylabel="CLE (px of 512)", xlabel="frame number (shaded: not scored)")
     lower.set_ylim(bottom=0)
-    upper.legend(loc="lower right", fontsize=8, ncols=4)
+    upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=4)  # beside the title
     figure.savefig(path, dpi=110)
 
 
