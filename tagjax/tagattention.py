@@ -258,10 +258,8 @@ class TagAttention(AbstractTracer):
         self.log_coherent_weight = stored_log(coherent_weight)
         self.coherent_level = jnp.asarray(coherent_level, jnp.float32)
         self.log_phase_weight, self.log_phase_slack = stored_log(phase_weight), stored_log(phase_slack)
-        self.log_phase_spread, self.log_phase_rest_spread = (
-            stored_log(phase_spread_rad),
-            stored_log(phase_rest_spread_rad),
-        )
+        self.log_phase_spread = stored_log(phase_spread_rad)
+        self.log_phase_rest_spread = stored_log(phase_rest_spread_rad)
         self.logit_phase_outlier = stored_logit(phase_outlier)
         self.log_v0, self.log_gate_width = stored_log(v0_m_s), stored_log(gate_width_m_s)
         self.log_memory, self.log_evidence_limit = stored_log(memory_s), stored_log(evidence_limit)

@@ -57,10 +57,9 @@ def _fourier(size: int) -> tuple[np.ndarray, np.ndarray]:
     At this size products take no longer than a fast transform, which in a loop on few cores can wait for ever: XLA's (jaxlib
     0.10) waits on a thread of the pool that its own threads come from.
     """
-    turns = 2 * np.pi / size * np.outer(np.arange(size // 2 + 1), np.arange(size))
-    forward = np.concatenate([np.cos(turns), np.sin(turns)])
-    weight = np.where(2 * np.arange(size // 2 + 1) % size == 0, 1.0, 2.0) / size
-    return forward, (forward * np.concatenate([weight, weight])[:, None]).T
+    forward = np.fft.rfft(np.eye(size), axis=0)
+    back = np.fft.irfft(np.concatenate([np.eye(len(forward)), -1j * np.eye(len(forward))], axis=1), size, axis=0)
+    return np.concatenate([forward.real, -forward.imag]), back
 
 
 def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
