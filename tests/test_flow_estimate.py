@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 import yaml
+from hydra import compose, initialize_config_dir
 from jaxtyping import Array, Float
 
 import tagjax.flow.estimate
@@ -479,6 +480,11 @@ def test_packaged_weights_are_found_by_name_and_by_network(packaged):
     assert isinstance(flow, NetworkFlow)
     _same(flow.network, small_network(5))
     assert make_flow("pyramid") is flow
+    # Of several files for a class, the one for this very network.
+    fine, wide = {**SETTINGS, "octaves": [0, 1]}, {**SETTINGS, "octaves": [-1, 0]}
+    save_weights(packaged / "pyramid_fine.npz", build({**fine, "seed": 6}), {"flow": fine})
+    for settings, seed in ((SETTINGS, 5), (fine, 6), (wide, 5)):
+        _same(load_weights(build(settings)), build({**settings, "seed": seed}))
     with pytest.raises(ValueError, match="Unknown optical flow 'pyramids'"):
         flow_key("pyramids")
 
@@ -529,6 +535,13 @@ def test_clips_take_any_named_flow(stored, tmp_path):
     np.testing.assert_array_equal(clip.frames.forward_px[0], 0)
     expected = pair_flow(recording, 2, 3, str(path))[0][0, ::2, ::2] / 2
     np.testing.assert_allclose(clip.frames.forward_px[2], expected, atol=1e-6)
+
+
+def test_the_fine_pyramid_differs_by_its_octaves_only():
+    with initialize_config_dir(str(CONF.parent), version_base="1.3"):
+        plain, fine = (compose("train_flow", [f"flow={name}"]).flow for name in ("pyramid", "pyramid_fine"))
+    assert {**fine, "octaves": plain.octaves} == plain
+    assert list(fine.octaves) == weights_about("pyramid_fine")["flow"]["octaves"] != list(plain.octaves)
 
 
 @pytest.mark.parametrize("name", [*sorted(CLASSICAL), "pyramid"])

@@ -34,6 +34,7 @@ PUBLISHED: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "flownet_c": FlowNetC,
     "raft_small": RAFTSmall,
     "pyramid": PyramidFlow,
+    "pyramid_fine": lambda: PyramidFlow(octaves=(-1, 0, 1, 2)),
 }
 TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "flownet_s": lambda: FlowNetS(width=1 / 64),
@@ -41,6 +42,7 @@ TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "raft_small": lambda: RAFTSmall(updates=2, levels=2, radius=1),
     "raft_small_lean": lambda: RAFTSmall(updates=2, levels=2, radius=1, all_pairs=False),
     "pyramid": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,))),
+    "pyramid_fine": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,)), octaves=(-1, 0, 1, 2)),
 }
 
 
@@ -103,6 +105,7 @@ def _count(network: Any) -> int:
         ("flownet_c", 39_175_298),
         ("raft_small", 990_162),
         ("pyramid", 691_020),
+        ("pyramid_fine", 691_020),
     ],
 )
 def test_parameters_are_as_many_as_published(name, count):
@@ -116,6 +119,7 @@ def test_parameters_are_as_many_as_published(name, count):
         ("flownet_c", [64, 32, 16, 8, 4, 1]),
         ("raft_small", [8] * 12 + [1]),
         ("pyramid", [32, 16, 8, 4, 1]),
+        ("pyramid_fine", [64, 32, 16, 8, 8, 4, 2, 1, 1]),
     ],
 )
 def test_estimates_go_from_rough_to_the_pictures_size(name, strides):
@@ -227,6 +231,26 @@ def test_the_flownets_own_unit_does_not_leak_out(name):
         np.testing.assert_allclose(flow, np.broadcast_to([20 / stride, -40 / stride], flow.shape), rtol=1e-6)
 
 
+@pytest.mark.parametrize("octaves", [(0,), (-1, 0), (0, 1), (-1, 0, 1, 2), (-2, -1, 0)])
+def test_octaves_of_the_pyramid_go_on_from_one_another(octaves):
+    """With heads that say (1, -2), every correction counts by the stride of its level on its octave."""
+    network = PyramidFlow((6, 8), (1, 2), (2, 3), ((8,), (8,)), octaves)
+    network = eqx.tree_at(lambda n: [d.head.weight for d in n.decoders], network, replace_fn=jnp.zeros_like)
+    biases = lambda n: [d.head.bias for d in n.decoders]  # noqa: E731
+    network = eqx.tree_at(biases, network, replace_fn=lambda _: jnp.asarray([1.0, -2.0]))
+    total, expected = 0.0, []
+    for octave in octaves:
+        for level in (1, 0) if octave == octaves[0] or octave <= 0 else (0,):
+            stride = 4 * 2.0 ** (level - octave)
+            total += (2, 3)[level] * stride
+            expected.append(total / stride)
+    side = 8 * 2 ** -octaves[0] * 4
+    flows = _jitted()(network, *_pictures(side, side))
+    for flow, value in zip(flows, [*expected, total], strict=True):
+        np.testing.assert_allclose(flow, np.broadcast_to([value, -2 * value], flow.shape), rtol=1e-5)
+    assert flows[-1].shape == (side, side, 2)
+
+
 @pytest.mark.slow
 def test_a_raft_update_answers_for_its_own_correction_only():
     network = _tiny("raft_small")
@@ -266,6 +290,10 @@ def test_raft_takes_pictures_smaller_than_its_pyramid():
         lambda: RAFTSmall(levels=0),
         lambda: PyramidFlow((8,), (1, 2), decoder_widths=((8,),)),
         lambda: PyramidFlow((8,), (1,), (0,), ((8,),)),
+        lambda: PyramidFlow(octaves=()),
+        lambda: PyramidFlow(octaves=(0, 2)),
+        lambda: PyramidFlow(octaves=(1, 2)),
+        lambda: PyramidFlow(octaves=(0, -1)),
     ],
 )
 def test_settings_that_make_no_network_are_refused(make):

@@ -27,12 +27,13 @@ from tagjax.data.picture_pairs import (
     pair_dataset,
     vary,
 )
+from tagjax.flow.estimate import NetworkFlow
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
 from tagjax.recording import RecordingError
-from tagjax.sim.flow_pairs import FlowPairSettings
+from tagjax.sim.flow_pairs import FlowPair, FlowPairSettings
 from tagjax.training.checkpoint import Checkpoints
 from tagjax.training.flow_run import flow_of, flow_of_peer, run_flow_training, scores
 from tagjax.training.flow_sources import DrawnSettings, drawn_pairs, flow_dataset, validation_pairs
@@ -433,6 +434,18 @@ def test_peers_and_scores_are_what_they_are_called(tmp_path: Path) -> None:
     np.testing.assert_allclose(zero["all"], np.mean(np.linalg.norm(truth, axis=-1)), rtol=1e-5)
     assert scores(flow_of_peer("dis", pairs), pairs)["visible"] < zero["visible"]
     assert flow_of(small_network(), pairs).shape == truth.shape
+
+
+def test_networks_are_validated_on_pairs_of_any_size() -> None:
+    network = small_network()
+    pictures = smooth_pictures(4, 70, 90).astype(np.float32) / 255
+    firsts, seconds = pictures[:2], pictures[2:]
+    flows, hidden = jnp.zeros((2, 70, 90, 2)), jnp.zeros((2, 70, 90), bool)
+    pairs = FlowPair(jnp.asarray(firsts), jnp.asarray(seconds), flows, flows, hidden, hidden)
+    assert 70 % network.divisor
+    assert 90 % network.divisor
+    expected = [NetworkFlow(network)(first, second) for first, second in zip(firsts, seconds, strict=True)]
+    np.testing.assert_allclose(flow_of(network, pairs), expected, atol=1e-5)
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:

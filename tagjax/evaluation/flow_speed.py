@@ -56,7 +56,9 @@ def _step(seed: int) -> Callable[[], Any]:
 
 
 def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timing]:
-    """One way and both ways beside DIS, along a video, and a step of training; weights are untrained.
+    """One way and both ways beside DIS, the fine pyramid, along a video, and a step of training.
+
+    The fine pyramid comes as packaged; the weights of the others are untrained.
 
     All times are of whole calls, from pictures of bytes to flow on the host.
     """
@@ -65,7 +67,12 @@ def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timin
     first, second = pictures[:2]
     network = NetworkFlow(PyramidFlow(seed=seed))
     compile_s = first_call_s(lambda: network(first, second))
-    calls: dict[str, Callable[[], Any]] = {"pyramid": lambda: network(first, second)}
+    fine = make_flow("pyramid_fine")
+    fine_compile_s = first_call_s(lambda: fine(first, second))
+    calls: dict[str, Callable[[], Any]] = {
+        "pyramid": lambda: network(first, second),
+        "fine": lambda: fine(first, second),
+    }
     peers = {name: make_flow(name) for name in _DIS}
     calls |= {name: lambda flow=flow: flow(first, second) for name, flow in peers.items()}
     calls["pyramid along"] = lambda: list(flow_along(network, pictures))
@@ -76,6 +83,7 @@ def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timin
         Timing(f"pyramid, {size}, one way", taken["pyramid"], shown, taken[name], compile_s, memory["forward"])
         for name, shown in _DIS.items()
     ]
+    timings.append(Timing(f"pyramid_fine, {size}, one way", taken["fine"], "DIS medium", taken["dis"], fine_compile_s))
     both = taken["pyramid along"] / pairs, "DIS medium, both ways", taken["dis along"] / pairs
     timings.append(Timing(f"pyramid, {size}, both ways, a frame of a video", *both))
     step = _step(seed)

@@ -15,9 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..image.warp import gather
-from ._layers import Conv, convex_upsample, enlarge, enlarge_flow, rectify, space_to_depth
+from ._layers import Conv, convex_upsample, enlarge, enlarge_flow, rectify, shrink, space_to_depth
 from .cost_volume import cost_volume, normalise_features
 from .network import AbstractFlowNetwork
+
+Features = tuple[Float[Array, "_ _ _"], ...]
 
 _FINEST = 4
 _HIDDEN = 32
@@ -64,12 +66,17 @@ class PyramidFlow(AbstractFlowNetwork):
     `widths` are the features of the levels, finest first, `radii` their search radii in pixels of the level,
     `iterations` how often each corrects its flow with the same weights, around where the last correction led (None:
     twice, but once at the finest and the roughest), and `decoder_widths` the hidden layers (the last is always 32).
+
+    `octaves` are the sizes of the picture, as powers of two, that the same weights are laid on in turn, each going on
+    from the flow of the one before: all levels on the smallest, the finest two where the picture is not enlarged, the
+    finest alone where it is. -1 reaches twice as far; each above 0 is twice as exact and takes four times as long.
     """
 
     encoders: tuple[tuple[Conv, Conv], ...]
     decoders: tuple[_Decoder, ...]
     upsampler: Conv
     iterations: tuple[int, ...] = eqx.field(static=True, converter=tuple)
+    octaves: tuple[int, ...] = eqx.field(static=True, converter=tuple)
     divisor: int = eqx.field(static=True)
 
     def __init__(
@@ -78,6 +85,7 @@ class PyramidFlow(AbstractFlowNetwork):
         radii: Sequence[int] = (2, 3, 4, 4),
         iterations: Sequence[int] | None = None,
         decoder_widths: Sequence[Sequence[int]] = ((32, 32), (64, 64), (64, 64), (64, 64)),
+        octaves: Sequence[int] = (0,),
         *,
         seed: int = 0,
     ):
@@ -90,6 +98,12 @@ class PyramidFlow(AbstractFlowNetwork):
             )
         if min(iterations) < 1:
             raise ValueError(f"iterations are {tuple(iterations)}; every level takes at least 1.")
+        if (
+            not octaves
+            or list(octaves) != list(range(octaves[0], octaves[-1] + 1))
+            or not octaves[0] <= 0 <= octaves[-1]
+        ):
+            raise ValueError(f"octaves are {tuple(octaves)}; expected neighbouring ones with 0 among them, rising.")
         count = len(widths)
         keys = jax.random.split(jax.random.key(seed), 3 * count + 1)
         first = Conv(3 * _FINEST**2, widths[0], key=keys[0])
@@ -103,30 +117,56 @@ class PyramidFlow(AbstractFlowNetwork):
         )
         self.iterations = tuple(iterations)
         self.upsampler = Conv(_HIDDEN, 9 * _CONVEX**2, 1, gain=0.1, key=keys[-1])
-        self.divisor = _FINEST * 2 ** (count - 1)
+        self.octaves = tuple(octaves)
+        self.divisor = _FINEST * 2 ** (count - 1 - self.octaves[0])
 
-    def encode(self, image: Float[Array, "height width 3"]) -> tuple[Float[Array, "_ _ _"], ...]:
-        """Features, finest first; the picture's mean and contrast are taken out."""
+    def encode(self, image: Float[Array, "height width 3"]) -> tuple[Features, ...]:
+        """Features of every octave, finest level first; the picture's mean and contrast are taken out."""
+        return tuple(self._features(_sized(image, octave), self._levels(octave)) for octave in self.octaves)
+
+    def decode(self, first: tuple[Features, ...], second: tuple[Features, ...]) -> tuple[Float[Array, "_ _ 2"], ...]:
+        flows: list[Array] = []
+        finer = None
+        for one, other in zip(first, second, strict=True):
+            height, width, _ = one[-1].shape
+            if finer is None:
+                flow = jnp.zeros((height, width, 2))
+            else:
+                # Half the size of the last octave's picture, and so of the finest level on this one.
+                flow = _sized_flow(finer, 1 - len(one))
+            hidden = jnp.zeros((height, width, _HIDDEN))
+            for level in reversed(range(len(one))):
+                if level < len(one) - 1:
+                    flow, hidden = enlarge_flow(flow, 2), enlarge(hidden, 2)
+                for _ in range(self.iterations[level]):
+                    flow, hidden = self.decoders[level](one[level], other[level], flow, hidden)
+                flows.append(flow)
+            finer = convex_upsample(flow, self.upsampler(hidden), _CONVEX)
+        return (*flows, _sized_flow(finer, 1 - self.octaves[-1]))
+
+    def _levels(self, octave: int) -> int:
+        """How many of the levels, finest first, are used on an octave."""
+        if octave == self.octaves[0]:
+            return len(self.encoders)
+        return 1 if octave > 0 else min(2, len(self.encoders))
+
+    def _features(self, image: Float[Array, "height width 3"], levels: int) -> Features:
         centred = image - jnp.mean(image, axis=(0, 1), keepdims=True)
         x = space_to_depth(centred * jax.lax.rsqrt(jnp.mean(centred * centred) + 1e-3), _FINEST)
         features = []
-        for enter, refine in self.encoders:
+        for enter, refine in self.encoders[:levels]:
             x = rectify(refine(rectify(enter(x))))
             features.append(x)
         return tuple(features)
 
-    def decode(
-        self, first: tuple[Float[Array, "_ _ _"], ...], second: tuple[Float[Array, "_ _ _"], ...]
-    ) -> tuple[Float[Array, "_ _ 2"], ...]:
-        height, width, _ = first[-1].shape
-        flow, hidden = jnp.zeros((height, width, 2)), jnp.zeros((height, width, _HIDDEN))
-        flows: list[Array] = []
-        levels = zip(self.decoders, self.iterations, first, second, strict=True)
-        for decoder, iterations, one, other in list(levels)[::-1]:
-            if flows:
-                flow, hidden = enlarge_flow(flow, 2), enlarge(hidden, 2)
-            for _ in range(iterations):
-                flow, hidden = decoder(one, other, flow, hidden)
-            flows.append(flow)
-        finer = convex_upsample(flow, self.upsampler(hidden), _CONVEX)
-        return (*flows, enlarge_flow(finer, _FINEST // _CONVEX))
+
+def _sized(image: Float[Array, "height width channel"], octave: int) -> Float[Array, "rows columns channel"]:
+    """2^octave times as large."""
+    if octave == 0:
+        return image
+    return enlarge(image, 2**octave) if octave > 0 else shrink(image, 2**-octave)
+
+
+def _sized_flow(flow_px: Float[Array, "height width 2"], octave: int) -> Float[Array, "rows columns 2"]:
+    """2^octave times as large, in pixels of that size."""
+    return _sized(flow_px, octave) * 2.0**octave

@@ -131,9 +131,13 @@ def weights_about(source: str | Path) -> dict[str, Any]:
 
 def _packaged_for(network: AbstractFlowNetwork) -> Path:
     own = f"{type(network).__module__}.{type(network).__name__}"
-    for name in packaged_weights():
-        if weights_about(name)["flow"].get("_target_") == own:
-            return PACKAGED / f"{name}.npz"
+    about = {name: weights_about(name)["flow"] for name in packaged_weights()}
+    fitting = [name for name, settings in about.items() if settings.get("_target_") == own]
+    # For this very network, if there are any; otherwise for its class.
+    structure = jax.tree.structure(network)
+    same = [name for name in fitting if jax.tree.structure(_outline(about[name], name)) == structure]
+    if fitting:
+        return PACKAGED / f"{(same or fitting)[0]}.npz"
     there = ", ".join(packaged_weights()) or "none"
     raise ValueError(f"No weights are packaged for {own} (there are: {there}). Train it, or give a file of weights.")
 

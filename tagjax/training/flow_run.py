@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from ..config import TrainFlowConfig, build
 from ..data.picture_pairs import VariationSettings
 from ..evaluation.benchmark import machine
 from ..evaluation.report import write_json
+from ..flow.estimate import one_way
 from ..flow.named import make_flow
 from ..flow.network import AbstractFlowNetwork
 from ..flow.weights import load_weights, save_weights
@@ -138,11 +140,11 @@ def _check_sizes(network: AbstractFlowNetwork, variation: VariationSettings) -> 
 
 @eqx.filter_jit
 def _flows(network: AbstractFlowNetwork, first: jax.Array, second: jax.Array) -> jax.Array:
-    return jax.vmap(lambda a, b: network.decode(network.encode(a), network.encode(b))[-1])(first, second)
+    return jax.vmap(functools.partial(one_way, network))(first, second)
 
 
 def flow_of(network: AbstractFlowNetwork, pairs: FlowPair, batch: int = 8) -> np.ndarray:
-    """The network's flow of stacked pairs, first to second."""
+    """The network's flow of stacked pairs of any size, first to second."""
     count = pairs.first.shape[0]
     parts = [
         np.asarray(_flows(network, pairs.first[i : i + batch], pairs.second[i : i + batch]))
