@@ -14,7 +14,7 @@ from scipy.interpolate import lagrange
 from tagjax.recording import TagReads
 from tagjax.rf import refine, resample
 from tagjax.rf.channels import estimate_slope
-from tagjax.rf.coherence import coherence, phase_residual
+from tagjax.rf.coherence import coherence, phase_likelihood, phase_residual
 from tagjax.rf.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
 from tagjax.rf.noise import pi_flip_share, thermal_sigma_rad
 from tagjax.rf.phase import distance_to_phase, phase_to_distance
@@ -146,6 +146,64 @@ def test_coherence_gradient_agrees_with_finite_differences(gradients_agree):
     channel = jnp.asarray(rng.integers(0, 3, 20))
     weight = rng.uniform(0.5, 1, 20)
     gradients_agree(lambda r, w: coherence(r, w, channel, num_channels=3, multiple=2), (rng.uniform(0, 6, 20), weight))
+
+
+def _likelihood_by_search(residual, concentration, channel, flip_share) -> float:
+    """NumPy: each channel's offset by trying thousands."""
+    total, offsets = 0.0, np.linspace(-np.pi, np.pi, 7201)[:-1]
+    for c in set(channel):
+        e, k = residual[channel == c], concentration[channel == c]
+        towards = k * np.cos(e[None] - offsets[:, None])
+        either = np.log((1 - flip_share) * np.exp(towards) + flip_share * np.exp(-towards))
+        each = np.sum(either - np.log(np.i0(k)), axis=1)
+        total += each.max()
+    return total
+
+
+@pytest.mark.parametrize("spread_rad", [0.05, 0.3])
+def test_phase_likelihood_profiles_offsets_and_marginalises_flips(spread_rad):
+    rng = np.random.default_rng(4)
+    channel = rng.integers(0, 3, 40)
+    flips = np.pi * (rng.uniform(size=40) < 0.15)
+    residual = rng.uniform(-np.pi, np.pi, 3)[channel] + rng.normal(0, spread_rad, 40) + flips
+    concentration = rng.uniform(2, 10, 40)
+    known = [jnp.asarray(part, jnp.float32) for part in (residual, concentration)]
+    found = phase_likelihood(*known, jnp.asarray(channel), num_channels=4, flip_share=0.1)
+    np.testing.assert_allclose(found, _likelihood_by_search(residual, concentration, channel, 0.1), rtol=2e-3)
+    # Where flips are as likely as not, turning reads by pi changes nothing.
+    even = phase_likelihood(*known, jnp.asarray(channel), num_channels=4, flip_share=0.5)
+    turned = known[0] + jnp.pi * jnp.asarray(rng.integers(0, 2, 40), jnp.float32)
+    again = phase_likelihood(turned, known[1], jnp.asarray(channel), num_channels=4, flip_share=0.5)
+    np.testing.assert_allclose(again, even, rtol=1e-4)
+    assert float(found) > float(even)
+
+
+def test_phase_likelihood_without_flips_is_that_of_the_phasor():
+    rng = np.random.default_rng(5)
+    residual, concentration = rng.normal(1.0, 0.4, (2, 20)), rng.uniform(1, 8, 20)
+    found = phase_likelihood(
+        jnp.asarray(residual, jnp.float32),
+        jnp.asarray(concentration, jnp.float32),
+        jnp.zeros(20, int),
+        num_channels=2,
+        flip_share=1e-7,
+    )
+    phasor = np.abs(np.sum(concentration * np.exp(1j * residual), axis=-1))
+    expected = phasor - np.sum(np.log(np.i0(concentration)))
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+def test_phase_likelihood_of_nothing_and_its_gradient(gradients_agree):
+    nothing = phase_likelihood(jnp.ones(5), jnp.zeros(5), jnp.zeros(5, int), num_channels=2, flip_share=0.05)
+    np.testing.assert_allclose(nothing, 0.0, atol=1e-6)
+    rng = np.random.default_rng(6)
+    channel = jnp.asarray(rng.integers(0, 3, 20))
+
+    def value(residual, concentration):
+        settled = {"num_channels": 3, "flip_share": 0.05, "num_iterations": 60}
+        return phase_likelihood(residual, concentration, channel, **settled)
+
+    gradients_agree(jax.jit(value), (rng.normal(0.5, 0.5, 20), rng.uniform(1, 8, 20)))
 
 
 @pytest.mark.parametrize("size", [8, 9, 48])

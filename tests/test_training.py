@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
 import signal
 from pathlib import Path
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -90,6 +92,23 @@ def test_true_motion_explains_own_reads_and_no_others() -> None:
     assert float(numbers["own_wins"]) == pytest.approx(1.0)
 
 
+def test_likelihood_tells_tags_apart_whatever_is_flipped() -> None:
+    settings = dataclasses.replace(SETTINGS, evidence="likelihood", temperature=2.0)
+    seen = _said_with_true_steps(_clip())
+    flips = np.random.default_rng(0).uniform(size=seen.reads.phase_rad.shape) < 0.1
+    flipped = eqx.tree_at(lambda s: s.reads.phase_rad, seen, seen.reads.phase_rad + jnp.where(flips, jnp.pi, 0.0))
+    loss, numbers = eqx.filter_jit(contrast)(flipped, settings, KEY)
+    assert float(numbers["own_wins"]) == pytest.approx(1.0)
+    assert float(loss) < 0.1
+    found = eqx.filter_jit(agreement)(flipped, settings, KEY)
+    clean = eqx.filter_jit(agreement)(seen, settings, KEY)
+    own, own_clean = (np.einsum("iip->ip", np.asarray(one.between)) for one in (found, clean))
+    # A flip costs about log(0.95 / 0.05) nats, not the read's whole weight.
+    assert (own > 0.5 * own_clean).all()
+    with pytest.raises(ValueError, match="flip_share is 0"):
+        ObjectiveSettings(flip_share=0.0)
+
+
 def test_reads_of_a_resting_tag_have_no_say() -> None:
     seen = _said_with_true_steps(_clip())
     still = eqx.tree_at(lambda s: s.reads.phase_rad, seen, jnp.ones_like(seen.reads.phase_rad))
@@ -122,7 +141,9 @@ def test_a_clip_without_reads_or_depth_gives_finite_gradients() -> None:
         assert np.isfinite(float(logged["loss"]))
 
 
-def test_gradient_agrees_with_finite_differences() -> None:
+@pytest.mark.parametrize("evidence", ["coherence", "likelihood"])
+def test_gradient_agrees_with_finite_differences(evidence: Literal["coherence", "likelihood"]) -> None:
+    settings = dataclasses.replace(SETTINGS, evidence=evidence)
     with jax.enable_x64(True):
         clip = jax.tree.map(
             lambda leaf: leaf.astype(jnp.float64) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, _clip(14)
@@ -132,12 +153,12 @@ def test_gradient_agrees_with_finite_differences() -> None:
         @jax.jit
         def loss(level: jax.Array) -> jax.Array:
             moved = eqx.tree_at(lambda t: t.level, tracer, level)
-            terms, _ = objective(moved, clip.camera, clip.frames, KEY, SETTINGS)
-            return SETTINGS.contrast * terms["contrast"] + SETTINGS.coverage * terms["coverage"]
+            terms, _ = objective(moved, clip.camera, clip.frames, KEY, settings)
+            return settings.contrast * terms["contrast"] + settings.coverage * terms["coverage"]
 
         level, step = tracer.level, 1e-5
         numeric = (loss(level + step) - loss(level - step)) / (2 * step)
-        gradient, logged = clip_gradient(tracer, clip.camera, clip.frames, KEY, SETTINGS)
+        gradient, logged = clip_gradient(tracer, clip.camera, clip.frames, KEY, settings)
         assert float(gradient.level) == pytest.approx(float(numeric), rel=1e-5)
         assert abs(float(numeric)) > 1e-4
         assert float(logged["loss"]) == pytest.approx(float(loss(level)), rel=1e-9)

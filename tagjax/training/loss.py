@@ -1,7 +1,7 @@
 """Label-free objective: where the mask goes must explain what the tag's reads say, and nobody else's.
 
-The soft mask's distance over time, linear between frames, is held against raw phases by their coherence: nothing is
-unwrapped, and no label is used. Each term is a function of a `Seen` clip; `TERMS` names them, settings weigh them.
+The soft mask's distance over time, linear between frames, is held against raw phases by their coherence or likelihood:
+nothing is unwrapped, and no label is used. Each term is a function of a `Seen` clip; `TERMS` names them, settings weigh them.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics import safe_divide
-from ..rf.coherence import coherence, phase_residual
+from ..rf.coherence import coherence, phase_likelihood, phase_residual
 from ..rf.reads import PhaseReads
 from ..tracer import AbstractTracer, Camera, Frame, Trace, trace
 
@@ -28,7 +28,9 @@ class ObjectiveSettings:
 
     contrast: float = 1.0
     coverage: float = 0.3
-    temperature: float = 0.1  # of the contrast, in units of coherence
+    evidence: Literal["coherence", "likelihood"] = "coherence"  # of the contrast
+    temperature: float = 0.1  # of the contrast, in units of coherence; of the likelihood in nats
+    flip_share: float = 0.05  # of the likelihood: reads that are off by pi
     num_shifts: int = 4  # time-shifted copies of the own motion among the negatives
     span_frames: int = 6  # coherence is taken over pieces this long: drift of the sum does not reach further
     skip_frames: int = 12  # at the start of a clip, while the tracer has not seen enough
@@ -36,11 +38,15 @@ class ObjectiveSettings:
     rest_margin: float = 0.05  # a piece whose reads lose less coherence than this by taking the tag to rest is left out
     max_reads: int = 384  # reads of one tag in a clip
     num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
-    multiple: int = 1  # 2 takes phases modulo pi: right whether the reader flips or not, but ambiguous twice as soon
+    multiple: int = 1  # of the coherence: 2 takes phases modulo pi: right whether the reader flips or not, but ambiguous twice as soon
     future_alpha_m2: float = 1e-3  # a pixel agrees with the future if it is within about the root of this
     future_stride: int = 2  # every n-th working pixel is asked
     rematerialise: bool = True  # keep only the tracer's states for the backward pass
     memory: float = 0.5  # share of the gradient that a frame hands on to the frame before
+
+    def __post_init__(self) -> None:
+        if not 0 < self.flip_share < 1:
+            raise ValueError(f"flip_share is {self.flip_share}; expected a share between 0 and 1, both left out.")
 
     def weights(self) -> dict[str, float]:
         """The weight of each term that takes part, by name."""
@@ -148,11 +154,12 @@ def _pieces(
 
 
 class Agreement(eqx.Module):
-    """Coherence of each tag's reads with candidate motions, per piece of the clip; pieces of all antennas in a row."""
+    """How well candidate motions explain each tag's reads, per piece of the clip; pieces of all antennas in a row."""
 
     between: Float[Array, "reads_of motion_of piece"]  # reads of one tag with the motion of another's mask
     altered: Float[Array, "tag candidate piece"]  # own reads with altered own motion
     still: Float[Array, "tag piece"]  # own reads with no motion at all
+    own_coherence: Float[Array, "tag piece"]  # whatever the evidence: own reads with own motion, 0 to 1
     weight: Float[Array, "tag piece"]  # how much the piece can tell: 0 for a tag that rests or is not read
 
 
@@ -178,28 +185,36 @@ def _agreement_of_antenna(
     num_tags, num_frames = steps.shape
     inside = _pieces(frame_time_s, reads, settings)
 
-    def score(one: PhaseReads, member: Bool[Array, "piece reads"], step_m: Float[Array, " time"]) -> Array:
+    def score(
+        evidence: str, one: PhaseReads, member: Bool[Array, "piece reads"], step_m: Float[Array, " time"]
+    ) -> Array:
         residual = phase_residual(one.phase_rad, one.carrier_hz, distance_at(step_m, frame_time_s, one.time_s))
         weight = member.astype(residual.dtype) / (jnp.square(one.sigma_rad) + 0.1)[None]
-        return coherence(
-            jnp.broadcast_to(residual, weight.shape),
-            weight,
-            jnp.broadcast_to(one.channel, weight.shape),
-            num_channels=settings.num_channels,
-            multiple=settings.multiple,
-        )
+        residual, channel = (jnp.broadcast_to(part, weight.shape) for part in (residual, one.channel))
+        if evidence == "likelihood":
+            return phase_likelihood(
+                residual, weight, channel, num_channels=settings.num_channels, flip_share=settings.flip_share
+            )
+        return coherence(residual, weight, channel, num_channels=settings.num_channels, multiple=settings.multiple)
 
     # Shifts stay clear of 0 from both sides: motion is alike within a few frames.
     clear = min(3, num_frames // 4)
     shifts = jax.random.randint(key, (num_tags, settings.num_shifts), clear, max(num_frames - clear, clear + 1))
     rolled = jax.vmap(lambda step, shift: jax.vmap(lambda by: jnp.roll(step, by))(shift))(steps, shifts)
     altered = jnp.concatenate([rolled, -steps[:, None]], axis=1)
-    over_motions = jax.vmap(score, in_axes=(None, None, 0))
-    between = jax.vmap(over_motions, in_axes=(0, 0, None))(reads, inside, steps)
-    still = jax.vmap(score, in_axes=(0, 0, None))(reads, inside, jnp.zeros(num_frames))
+    told, coherent = functools.partial(score, settings.evidence), functools.partial(score, "coherence")
+    over_motions = jax.vmap(told, in_axes=(None, None, 0))
+    rest = jnp.zeros(num_frames)
     # Reads of a resting tag are coherent with no motion at all, but for their noise.
-    weight = jnp.where(jnp.any(inside, axis=-1), jax.nn.relu(1.0 - still - settings.rest_margin), 0.0)
-    return Agreement(between, jax.vmap(over_motions)(reads, inside, altered), still, jax.lax.stop_gradient(weight))
+    lost = 1.0 - jax.vmap(coherent, in_axes=(0, 0, None))(reads, inside, rest)
+    weight = jnp.where(jnp.any(inside, axis=-1), jax.nn.relu(lost - settings.rest_margin), 0.0)
+    return Agreement(
+        between=jax.vmap(over_motions, in_axes=(0, 0, None))(reads, inside, steps),
+        altered=jax.vmap(over_motions)(reads, inside, altered),
+        still=jax.vmap(told, in_axes=(0, 0, None))(reads, inside, rest),
+        own_coherence=jax.vmap(coherent)(reads, inside, steps),
+        weight=jax.lax.stop_gradient(weight),
+    )
 
 
 def contrast(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
@@ -221,8 +236,8 @@ def contrast(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float
     mean = lambda values: safe_divide(jnp.sum(values * weight), jnp.sum(weight))  # noqa: E731
     best = jnp.max(candidates[:, 1:], axis=1)
     return mean(loss), {
-        "own_coherence": mean(own),
-        "best_other_coherence": mean(best),
+        "own_coherence": mean(found.own_coherence),
+        "ahead": mean(own - best),
         "own_wins": mean((own > best).astype(own.dtype)),
         "moving": jnp.mean(weight),
     }
