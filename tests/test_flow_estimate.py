@@ -31,7 +31,7 @@ from tagjax.data.flow_cache import pair_flow
 from tagjax.data.store import open_recording, save_recording
 from tagjax.flow.estimate import NetworkFlow, agreement, estimate, one_way, padding
 from tagjax.flow.losses import occluded
-from tagjax.flow.named import CLASSICAL, flow_along, flow_key, make_flow
+from tagjax.flow.named import CLASSICAL, VARIANTS, flow_along, flow_key, make_flow
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.flow.pictures import as_bytes, check_pictures
 from tagjax.flow.pyramid import PyramidFlow
@@ -480,11 +480,12 @@ def test_packaged_weights_are_found_by_name_and_by_network(packaged):
     assert isinstance(flow, NetworkFlow)
     _same(flow.network, small_network(5))
     assert make_flow("pyramid") is flow
-    # Of several files for a class, the one for this very network.
-    fine, wide = {**SETTINGS, "octaves": [0, 1]}, {**SETTINGS, "octaves": [-1, 0]}
-    save_weights(packaged / "pyramid_fine.npz", build({**fine, "seed": 6}), {"flow": fine})
-    for settings, seed in ((SETTINGS, 5), (fine, 6), (wide, 5)):
-        _same(load_weights(build(settings)), build({**settings, "seed": seed}))
+    fine = make_flow("pyramid_fine")
+    assert isinstance(fine, NetworkFlow)
+    _same(fine.network, build({**SETTINGS, "seed": 5, "octaves": [-1, 0, 1, 2]}))
+    assert make_flow("pyramid_fine") is fine
+    assert flow_key("pyramid_fine") != flow_key("pyramid")
+    assert make_flow("pyramid") is flow
     with pytest.raises(ValueError, match="Unknown optical flow 'pyramids'"):
         flow_key("pyramids")
 
@@ -541,7 +542,7 @@ def test_the_fine_pyramid_differs_by_its_octaves_only():
     with initialize_config_dir(str(CONF.parent), version_base="1.3"):
         plain, fine = (compose("train_flow", [f"flow={name}"]).flow for name in ("pyramid", "pyramid_fine"))
     assert {**fine, "octaves": plain.octaves} == plain
-    assert list(fine.octaves) == weights_about("pyramid_fine")["flow"]["octaves"] != list(plain.octaves)
+    assert {"pyramid_fine": ("pyramid", {"octaves": tuple(fine.octaves)})} == VARIANTS
 
 
 @pytest.mark.parametrize("name", [*sorted(CLASSICAL), "pyramid"])

@@ -6,6 +6,7 @@ import functools
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,16 +28,19 @@ class ZeroFlow:
 CLASSICAL: dict[str, Callable[[], FlowFunction]] = {"zero": ZeroFlow, **opencv.FLOWS}
 """Flows that learn nothing, by name."""
 
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {"pyramid_fine": ("pyramid", {"octaves": (-1, 0, 1, 2)})}
+"""Packaged weights with other settings of their network, by name."""
+
 
 def make_flow(name: str) -> FlowFunction:
-    """A flow by name: one of `CLASSICAL`, packaged weights (`pyramid`), or the path of an .npz file of weights.
+    """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
 
     Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
     """
     if name in CLASSICAL:
         return CLASSICAL[name]()
     path = _weights(name)
-    return _network_flow(str(path), _stamp(path))
+    return _network_flow(name if name in VARIANTS else "", str(path), _stamp(path))
 
 
 def flow_key(name: str) -> str:
@@ -47,7 +51,8 @@ def flow_key(name: str) -> str:
     if name in CLASSICAL:
         return name
     path = _weights(name)
-    return _weights_key(str(path), _stamp(path))
+    key = _weights_key(str(path), _stamp(path))
+    return f"{key}-{name}" if name in VARIANTS else key
 
 
 def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -66,12 +71,14 @@ def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[t
 
 
 def _weights(name: str) -> Path:
+    if name in VARIANTS:
+        return find_weights(VARIANTS[name][0])
     if name.endswith(".npz") or name in packaged_weights():
         return find_weights(name)
     there = ", ".join(packaged_weights()) or "none"
     raise ValueError(
-        f"Unknown optical flow {name!r}; expected one of {', '.join(CLASSICAL)}, packaged weights ({there}), or the path "
-        "of an .npz file of weights."
+        f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({there}), "
+        "or the path of an .npz file of weights."
     )
 
 
@@ -82,8 +89,8 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 @functools.lru_cache(maxsize=4)
-def _network_flow(path: str, stamp: tuple[int, int]) -> NetworkFlow:
-    return NetworkFlow(load_network(path))
+def _network_flow(variant: str, path: str, stamp: tuple[int, int]) -> NetworkFlow:
+    return NetworkFlow(load_network(path, **(VARIANTS[variant][1] if variant else {})))
 
 
 @functools.lru_cache(maxsize=64)

@@ -104,10 +104,13 @@ def load_weights(network: Network, source: str | Path = "default") -> Network:
     return _filled(network, find_weights(source))
 
 
-def load_network(source: str | Path) -> AbstractFlowNetwork:
-    """The network that a file of weights describes, with these weights; errors as of `load_weights`."""
+def load_network(source: str | Path, **changes: Any) -> AbstractFlowNetwork:
+    """The network that a file of weights describes, with these weights; errors as of `load_weights`.
+
+    `changes` take the place of settings of the file that no weight depends on.
+    """
     path = find_weights(source)
-    return _filled(_outline(weights_about(path)["flow"], str(path)), path)
+    return _filled(_outline({**weights_about(path)["flow"], **changes}, str(path)), path)
 
 
 def weights_about(source: str | Path) -> dict[str, Any]:
@@ -131,13 +134,9 @@ def weights_about(source: str | Path) -> dict[str, Any]:
 
 def _packaged_for(network: AbstractFlowNetwork) -> Path:
     own = f"{type(network).__module__}.{type(network).__name__}"
-    about = {name: weights_about(name)["flow"] for name in packaged_weights()}
-    fitting = [name for name, settings in about.items() if settings.get("_target_") == own]
-    # For this very network, if there are any; otherwise for its class.
-    structure = jax.tree.structure(network)
-    same = [name for name in fitting if jax.tree.structure(_outline(about[name], name)) == structure]
-    if fitting:
-        return PACKAGED / f"{(same or fitting)[0]}.npz"
+    for name in packaged_weights():
+        if weights_about(name)["flow"].get("_target_") == own:
+            return PACKAGED / f"{name}.npz"
     there = ", ".join(packaged_weights()) or "none"
     raise ValueError(f"No weights are packaged for {own} (there are: {there}). Train it, or give a file of weights.")
 
