@@ -10,12 +10,16 @@ from matplotlib.lines import Line2D
 
 from .figure import blank
 
+_ENTRY_IN = 1.5
+"""Width of an entry of the legend, inches."""
+
 
 def bar_plot(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, float | None]]]) -> None:
     """A panel a measure: its value by system and suite, 0 to 1; a cross where there is none."""
     by_system = next(iter(panels.values()))
     systems, suites = list(by_system), list(dict.fromkeys(suite for row in by_system.values() for suite in row))
-    figure = blank(max(5.5, 1.5 * len(suites) + 2.0), 2.4 * len(panels) + 0.6)
+    inches = max(5.5, 1.5 * len(suites) + 2.0)
+    figure = blank(inches, 2.4 * len(panels) + 0.6)
     grid = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
     width = 0.8 / len(systems)
     for axes, (measure, values) in zip(grid, panels.items(), strict=True):
@@ -41,7 +45,7 @@ def bar_plot(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, float | 
         [*handles, cross],
         [*labels, "does not apply"],
         loc="outside upper center",
-        ncols=min(6, len(systems) + 1),
+        ncols=min(len(systems) + 1, int(inches / _ENTRY_IN)),
         fontsize=8,
     )
     figure.savefig(path, dpi=120)
