@@ -167,13 +167,13 @@ def test_phase_likelihood_profiles_offsets_and_marginalises_flips(spread_rad):
     flips = np.pi * (rng.uniform(size=40) < 0.15)
     residual = rng.uniform(-np.pi, np.pi, 3)[channel] + rng.normal(0, spread_rad, 40) + flips
     concentration = rng.uniform(2, 10, 40)
-    known = [jnp.asarray(part, jnp.float32) for part in (residual, concentration)]
-    found = phase_likelihood(*known, jnp.asarray(channel), num_channels=4, flip_share=0.1)
+    phases, known = jnp.asarray(residual, jnp.float32), jnp.asarray(concentration, jnp.float32)
+    found = phase_likelihood(phases, known, jnp.asarray(channel), num_channels=4, flip_share=0.1)
     np.testing.assert_allclose(found, _likelihood_by_search(residual, concentration, channel, 0.1), rtol=2e-3)
     # Where flips are as likely as not, turning reads by pi changes nothing.
-    even = phase_likelihood(*known, jnp.asarray(channel), num_channels=4, flip_share=0.5)
-    turned = known[0] + jnp.pi * jnp.asarray(rng.integers(0, 2, 40), jnp.float32)
-    again = phase_likelihood(turned, known[1], jnp.asarray(channel), num_channels=4, flip_share=0.5)
+    even = phase_likelihood(phases, known, jnp.asarray(channel), num_channels=4, flip_share=0.5)
+    turned = phases + jnp.pi * jnp.asarray(rng.integers(0, 2, 40), jnp.float32)
+    again = phase_likelihood(turned, known, jnp.asarray(channel), num_channels=4, flip_share=0.5)
     np.testing.assert_allclose(again, even, rtol=1e-4)
     assert float(found) > float(even)
 

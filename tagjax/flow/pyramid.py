@@ -17,9 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..image.warp import gather
 from ._layers import Conv, convex_upsample, enlarge, enlarge_flow, rectify, shrink, space_to_depth
 from .cost_volume import cost_volume, normalise_features
-from .network import AbstractFlowNetwork
-
-Features = tuple[Float[Array, "_ _ _"], ...]
+from .network import AbstractFlowNetwork, Levels
 
 _FINEST = 4
 _HIDDEN = 32
@@ -120,21 +118,17 @@ class PyramidFlow(AbstractFlowNetwork):
         self.octaves = tuple(octaves)
         self.divisor = _FINEST * 2 ** (count - 1 - self.octaves[0])
 
-    def encode(self, image: Float[Array, "height width 3"]) -> tuple[Features, ...]:
+    def encode(self, image: Float[Array, "height width 3"]) -> tuple[Levels, ...]:
         """Features of every octave, finest level first; the picture's mean and contrast are taken out."""
         return tuple(self._features(_sized(image, octave), self._levels(octave)) for octave in self.octaves)
 
-    def decode(self, first: tuple[Features, ...], second: tuple[Features, ...]) -> tuple[Float[Array, "_ _ 2"], ...]:
+    def decode(self, first: tuple[Levels, ...], second: tuple[Levels, ...]) -> Levels:
         flows: list[Array] = []
-        finer = None
+        finer = jnp.zeros((*first[0][0].shape[:2], 2))
         for one, other in zip(first, second, strict=True):
-            height, width, _ = one[-1].shape
-            if finer is None:
-                flow = jnp.zeros((height, width, 2))
-            else:
-                # Half the size of the last octave's picture, and so of the finest level on this one.
-                flow = _sized_flow(finer, 1 - len(one))
-            hidden = jnp.zeros((height, width, _HIDDEN))
+            # The last octave's flow has the size of this one's finest level.
+            flow = _sized_flow(finer, 1 - len(one))
+            hidden = jnp.zeros((*flow.shape[:2], _HIDDEN))
             for level in reversed(range(len(one))):
                 if level < len(one) - 1:
                     flow, hidden = enlarge_flow(flow, 2), enlarge(hidden, 2)
@@ -150,7 +144,7 @@ class PyramidFlow(AbstractFlowNetwork):
             return len(self.encoders)
         return 1 if octave > 0 else min(2, len(self.encoders))
 
-    def _features(self, image: Float[Array, "height width 3"], levels: int) -> Features:
+    def _features(self, image: Float[Array, "height width 3"], levels: int) -> Levels:
         centred = image - jnp.mean(image, axis=(0, 1), keepdims=True)
         x = space_to_depth(centred * jax.lax.rsqrt(jnp.mean(centred * centred) + 1e-3), _FINEST)
         features = []
