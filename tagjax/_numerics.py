@@ -45,6 +45,11 @@ def circular_mean(
     return safe_atan2(jnp.sum(weight * jnp.sin(angle_rad), axis=-1), jnp.sum(weight * jnp.cos(angle_rad), axis=-1))
 
 
+def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """log I0(x) for x >= 0, without overflow."""
+    return jnp.log(jax.scipy.special.i0e(x)) + x
+
+
 def logit(probability: float) -> float:
     """Log odds of a Python probability in (0, 1); for the unconstrained initial value of a parameter."""
     if not 0.0 < probability < 1.0:

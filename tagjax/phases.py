@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._numerics import safe_norm
+from ._numerics import log_i0, safe_norm
 from .rf.phase import distance_to_phase
 from .rf.reads import PhaseReads
 
@@ -111,11 +111,6 @@ def explain(
         jnp.where(heard, after[at], turned[-1]),
         jnp.where(heard, moved[at] + fresh.left[at] * step_m, phasor.moved_m + step_m),
     )
-
-
-def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """log I0(x) for x >= 0, without overflow."""
-    return jnp.log(jax.scipy.special.i0e(x)) + x
 
 
 def _turn(phasor: Float[Array, " 2"], angle_rad: Float[Array, " reads"]) -> Float[Array, "reads 2"]:

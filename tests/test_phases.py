@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
-from tagjax.phases import MAX_FRESH_READS, Fresh, PhaseNoise, Phasor, explain, fresh_reads, log_i0
+from tagjax._numerics import log_i0
+from tagjax.phases import MAX_FRESH_READS, Fresh, PhaseNoise, Phasor, explain, fresh_reads
 from tagjax.rf.reads import PhaseReads
 
 C = 299_792_458.0

@@ -40,7 +40,7 @@ def make_flow(name: str) -> FlowFunction:
     if name in CLASSICAL:
         return CLASSICAL[name]()
     path = _weights(name)
-    return _network_flow(name if name in VARIANTS else "", str(path), _stamp(path))
+    return _network_flow(name, str(path), _stamp(path))
 
 
 def flow_key(name: str) -> str:
@@ -89,8 +89,9 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 @functools.lru_cache(maxsize=4)
-def _network_flow(variant: str, path: str, stamp: tuple[int, int]) -> NetworkFlow:
-    return NetworkFlow(load_network(path, **(VARIANTS[variant][1] if variant else {})))
+def _network_flow(name: str, path: str, stamp: tuple[int, int]) -> NetworkFlow:
+    changes = VARIANTS[name][1] if name in VARIANTS else {}
+    return NetworkFlow(load_network(path, **changes))
 
 
 @functools.lru_cache(maxsize=64)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._numerics import SPEED_OF_LIGHT_M_S, safe_atan2, safe_sqrt
+from .._numerics import SPEED_OF_LIGHT_M_S, log_i0, safe_atan2, safe_sqrt
 
 
 def phase_residual(
@@ -77,7 +77,7 @@ def phase_likelihood(
             offset = direction(concentration * jnp.tanh(towards + 0.5 * log_odds), 1.0)
         towards = concentration * jnp.cos(residual_rad - of_reads(jax.lax.stop_gradient(offset)))
         either = jnp.logaddexp(towards + jnp.log1p(-flip_share), jnp.log(flip_share) - towards)
-        return of_channels(either - concentration - jnp.log(jax.scipy.special.i0e(concentration)))
+        return of_channels(either - log_i0(concentration))
 
     half = direction(concentration, 2.0)
     return jnp.sum(jnp.maximum(likelihood(half), likelihood(half + jnp.pi)), axis=-1)
