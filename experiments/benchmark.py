@@ -28,22 +28,25 @@ def main(config: DictConfig) -> None:
     from tagjax.config import from_mapping
     from tagjax.evaluation.benchmark import BenchmarkSettings, machine, run_benchmark
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 140)  # a file has no width of its own
+    timings = []
     settings = from_mapping(BenchmarkSettings, resolved(config))
-    with console.status("measuring") as status:
-        timings = run_benchmark(settings, on_case=lambda name: status.update(f"measuring {name}"))
+    written = Path(HydraConfig.get().runtime.output_dir) / "benchmark.json"
     table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s", "memory, MiB")
-    for timing in timings:
-        first = f"{timing.compile_s:.1f}" if timing.compile_s else ""
-        memory = f"{timing.memory_mib:.0f}" if timing.memory_mib else ""
-        row = (timing.what, f"{timing.ours_ms:.2f}", timing.peer, f"{timing.peer_ms:.2f}", f"{timing.ratio:.2f}", first)
-        table.add_row(*row, memory)
+    with console.status("measuring") as status:
+        for timing in run_benchmark(settings, on_case=lambda name: status.update(f"measuring {name}")):
+            console.print(
+                f"{timing.what}: {timing.ours_ms:.2f} ms; {timing.peer}: {timing.peer_ms:.2f} ms", soft_wrap=True
+            )
+            first = f"{timing.compile_s:.1f}" if timing.compile_s else ""
+            memory = f"{timing.memory_mib:.0f}" if timing.memory_mib else ""
+            row = timing.what, f"{timing.ours_ms:.2f}", timing.peer, f"{timing.peer_ms:.2f}", f"{timing.ratio:.2f}"
+            table.add_row(*row, first, memory)
+            timings.append({**dataclasses.asdict(timing), "ratio": timing.ratio})
+            # After each, for a whole run takes minutes and may be stopped.
+            written.write_text(json.dumps({"machine": machine(), "timings": timings}) + "\n")
     console.print(table)
-    rows = [{**dataclasses.asdict(timing), "ratio": timing.ratio} for timing in timings]
-    text = json.dumps({"machine": machine(), "timings": rows})
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    (folder / "benchmark.json").write_text(text + "\n")
-    print(text)
+    print(written.read_text(), end="")
 
 
 def with_cases(arguments: list[str]) -> list[str]:

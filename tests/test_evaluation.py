@@ -25,7 +25,7 @@ from tagjax.evaluation.evaluate import (
 from tagjax.evaluation.report import plain, score_table, summarise, write_report
 from tagjax.recording import RecordingError
 from tagjax.tracer import Trace, trace
-from tagjax.viz.overlay import MIN_WIDTH
+from tagjax.viz.overlay import MIN_WIDTH, _extent, _free_place
 
 EPCS = list(synthetic.EPCS)
 
@@ -179,3 +179,19 @@ def test_plain_json_has_no_nan() -> None:
         "b": {"c": [0, 1], "3": True},
         "d": None,
     }
+
+
+@pytest.mark.parametrize(
+    "box", [(100, 60, 160, 180), (5, 3, 60, 239), (300, 4, 319, 100)], ids=["mid", "tall", "right"]
+)
+def test_labels_of_boxes_that_overlap_cover_neither_each_other_nor_leave_the_picture(box: tuple[int, int, int, int]):
+    taken: list[tuple[int, int, int, int]] = []
+    for _ in range(6):
+        extent = _extent("..000001 0.50", _free_place("..000001 0.50", box, taken, (240, 320)))
+        left, top, right, bottom = extent
+        assert left >= 0
+        assert top >= 0
+        assert right <= 320
+        assert bottom <= 240
+        assert not any(left < c and right > a and top < d and bottom > b for a, b, c, d in taken)
+        taken.append(extent)

@@ -9,7 +9,7 @@ import dataclasses
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import cv2
@@ -203,11 +203,11 @@ def _flow(settings: BenchmarkSettings) -> list[Timing]:
     return flow_timings(settings.height, settings.width, settings.repeats, settings.seed)
 
 
-def _training(settings: BenchmarkSettings) -> list[Timing]:
+def _training(settings: BenchmarkSettings) -> Iterator[Timing]:
     return training_timings(max(2, settings.repeats // 3), settings.seed)
 
 
-CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing]]] = {
+CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing] | Iterator[Timing]]] = {
     "gather": _gather,
     "splat": _splat,
     "segment": _segment,
@@ -236,12 +236,10 @@ def machine() -> dict[str, Any]:
     }
 
 
-def run_benchmark(settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None) -> list[Timing]:
-    """Measure every case; `on_case` is told the name of the one that begins."""
-    timings: list[Timing] = []
+def run_benchmark(settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None) -> Iterator[Timing]:
+    """Measure case after case, giving each figure as it is found; `on_case` is told the name of the one that begins."""
     for name in settings.cases:
         if on_case is not None:
             on_case(name)
         found = CASES[name](settings)
-        timings += found if isinstance(found, list) else [found]
-    return timings
+        yield from (found,) if isinstance(found, Timing) else found

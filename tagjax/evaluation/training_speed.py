@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -28,12 +29,11 @@ LENGTHS = (12, 24, 48, 96)
 _WIDTH, _HEIGHT, _STRIDE = 320, 240, 2
 
 
-def training_timings(repeats: int, seed: int) -> list[Timing]:
+def training_timings(repeats: int, seed: int) -> Iterator[Timing]:
     """A step for each length of a clip, steps of the tracer computed again in the backward pass and kept.
 
     Each is the other's peer; both have their memory told.
     """
-    timings = []
     for length in LENGTHS:
         again, kept = (step_cost(length, rematerialise, repeats, seed) for rematerialise in (True, False))
         what = f"training step, {length} frames of {_WIDTH // _STRIDE}x{_HEIGHT // _STRIDE}"
@@ -41,10 +41,7 @@ def training_timings(repeats: int, seed: int) -> list[Timing]:
             ("computed again", again, "kept", kept),
             ("kept", kept, "computed again", again),
         ):
-            timings.append(
-                Timing(f"{what}, {name}", one["step_ms"], peer, other["step_ms"], one["compile_s"], one["memory_mib"])
-            )
-    return timings
+            yield Timing(f"{what}, {name}", one["step_ms"], peer, other["step_ms"], one["compile_s"], one["memory_mib"])
 
 
 def step_cost(length: int, rematerialise: bool, repeats: int, seed: int) -> dict[str, float]:

@@ -20,6 +20,9 @@ PALETTE_RGB = (
 )
 """Colours of tags in their order, told apart on a dim room as well as on a bright one."""
 
+_SIZE = 0.45
+"""Of letters, in OpenCV's measure."""
+
 MIN_WIDTH = 480
 """Smaller pictures are enlarged by a whole factor, so that outlines and names stay readable."""
 
@@ -41,6 +44,7 @@ def draw_overlay(
     masks = masks.repeat(scale, axis=1).repeat(scale, axis=2)
     boxes_px = boxes_px * scale
     true_boxes_px = None if true_boxes_px is None else true_boxes_px * scale
+    labels: list[tuple[str, tuple[int, int, int, int], tuple[int, int, int]]] = []
     for tag, name in enumerate(names):
         shade = PALETTE_RGB[tag % len(PALETTE_RGB)]
         if true_boxes_px is not None and np.all(np.isfinite(true_boxes_px[tag])):
@@ -55,10 +59,44 @@ def draw_overlay(
         cv2.drawContours(picture, outline, -1, shade, 1)
         x0, y0, x1, y1 = np.round(boxes_px[tag]).astype(int).tolist()
         cv2.rectangle(picture, (x0, y0), (x1, y1), shade, 2)
-        _text(picture, f"{name} {confidence[tag]:.2f}", (x0, max(y0 - 5, 12)), shade)
+        labels.append((f"{name} {confidence[tag]:.2f}", (x0, y0, x1, y1), shade))
+    taken: list[tuple[int, int, int, int]] = []
     if caption:
-        _text(picture, caption, (6, picture.shape[0] - 8), (255, 255, 255))
+        place = 6, picture.shape[0] - 8
+        _text(picture, caption, place, (255, 255, 255))
+        taken.append(_extent(caption, place))
+    for text, box, shade in labels:
+        place = _free_place(text, box, taken, picture.shape[:2])
+        _text(picture, text, place, shade)
+        taken.append(_extent(text, place))
     return picture
+
+
+_LINE = 14
+"""Pixels from one line of text to the next."""
+
+
+def _extent(text: str, place: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of a text whose baseline begins at `place`."""
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, 1)
+    return place[0], place[1] - _LINE + 3, place[0] + width, place[1] + 3
+
+
+def _free_place(
+    text: str, box: tuple[int, int, int, int], taken: Sequence[tuple[int, int, int, int]], shape: tuple[int, ...]
+) -> tuple[int, int]:
+    """Where a box's label covers no other: the nearest line above the box, else below, else inside."""
+    x0, y0, _, y1 = box
+    left, _, right, _ = _extent(text, (0, 0))
+    x = max(min(x0, shape[1] - (right - left) - 2), 2)
+    above = range(max(y0 - 5, 12), 11, -_LINE)
+    below = range(min(y1 + _LINE, shape[0] - 4), shape[0] - 3, _LINE)
+    inside = range(above[-1] + _LINE, shape[0] - 3, _LINE)
+    for y in (*above, *below, *inside):
+        x_left, top, x_right, bottom = _extent(text, (x, y))
+        if all(x_right <= a or x_left >= c or bottom <= b or top >= d for a, b, c, d in taken):
+            return x, y
+    return x, above[0]
 
 
 def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
@@ -70,7 +108,7 @@ def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[i
 
 
 def _letters(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, shade, 1, cv2.LINE_AA)
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, shade, 1, cv2.LINE_AA)
 
 
 def short_name(epc: str, length: int = 6) -> str:
