@@ -19,18 +19,28 @@ from .view import Ranging, View
 
 
 class PhaseMemory(eqx.Module):
-    """Phasors of all pixels; of what rests, once as exactly as pixels are known and once exactly; and their channel."""
+    """Phasors of all pixels; of what rests, once as exactly as pixels are known and once exactly; and their channel.
+
+    `moving` is the reads' evidence against rest since it was last in favour (Page's cumulative sum, Biometrika 1954), in
+    nats against phases at random; `moved` is the most that it ever was: whether the tag has moved at all.
+    """
 
     pixels: Phasor
     rest: Phasor
     channel: Int[Array, "*batch"]
+    moving: Float[Array, "*batch"]
+    moved: Float[Array, "*batch"]
 
     @staticmethod
     def nothing(num_tags: int, num_antennas: int, height: int, width: int) -> PhaseMemory:
         """Of a recording that has not begun."""
         each = (num_tags, num_antennas)
         return PhaseMemory(
-            Phasor.nothing((*each, height, width)), Phasor.nothing((*each, 2)), jnp.full(each, -1, jnp.int32)
+            Phasor.nothing((*each, height, width)),
+            Phasor.nothing((*each, 2)),
+            jnp.full(each, -1, jnp.int32),
+            moving=jnp.zeros(each),
+            moved=jnp.zeros(each),
         )
 
 
@@ -45,7 +55,7 @@ def carry_phases(
         now = jnp.where(followed[..., None], now, 0.0)
         return jnp.moveaxis(now.reshape(last.shape), (0, 1), (2, 3))
 
-    return PhaseMemory(jax.tree.map(moved, memory.pixels), memory.rest, memory.channel)
+    return eqx.tree_at(lambda one: one.pixels, memory, jax.tree.map(moved, memory.pixels))
 
 
 def phase_evidence(
@@ -78,4 +88,6 @@ def phase_evidence(
     beyond = jax.nn.sigmoid(-still[1]) * (told - jax.nn.relu(still[0]))
     back = unpool(view.segments, jnp.concatenate([beyond[..., None], after.total, after.moved_m[..., None]], axis=-1))
     back = jnp.where(ranging.known[..., None], back, 0.0)
-    return back[..., 0], PhaseMemory(Phasor(back[..., 1:3], back[..., 3]), rest, fresh.channel)
+    moving = jax.nn.relu(memory.moving - still[1])
+    pixels = Phasor(back[..., 1:3], back[..., 3])
+    return back[..., 0], PhaseMemory(pixels, rest, fresh.channel, moving, jnp.maximum(memory.moved, moving))

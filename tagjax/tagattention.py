@@ -5,8 +5,8 @@ with the tag's (Eqs. 4-6), and coherence and phase memory with the raw phase rea
 flow and updated (Eq. 7 with a background class and forgetting), pooled in the segments (III.G), and cut.
 
 What goes beyond the paper: the range anchor, by which all of the past says how far away the tag is now; a memory of
-the still background; and an object is one compact thing in 3D, next to where it was a frame ago. `paper_limit` gives
-the settings at which all of it is gone and the likelihood and the cut are the paper's.
+the still background; tags that compete for pixels; and an object is one compact thing in 3D, next to where it was a frame
+ago. `paper_limit` gives the settings at which all of it is gone and the likelihood and the cut are the paper's.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .motion import MotionMap, carry, empty_motion, push_gather
 from .parameters import physical, stored_log, stored_logit, with_physical
 from .phase_memory import PhaseMemory, carry_phases, phase_evidence
 from .phases import PhaseNoise
-from .propagation import log_likelihood_ratio, propagate, radio_speed, soft_clip, velocity_gate
+from .propagation import log_likelihood_ratio, propagate, radio_speed, rival_log_odds, soft_clip, velocity_gate
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
 from .tracer import AbstractTracer, Camera, Frame, Trace, describe
@@ -49,6 +49,14 @@ class Place(eqx.Module):
     velocity_m_s: Float[Array, "*tag 3"]
     confidence: Float[Array, "*tag"]
     radius_m: Float[Array, "*tag"]  # root mean square distance of its points from the centre
+
+
+class Belief(eqx.Module):
+    """What a tag's radio says of every pixel by now, as log odds of object against background."""
+
+    log_odds: Float[Array, "*tag height width"]  # what is carried on to the next frame
+    held: Float[Array, "*tag height width"]  # spread over segments that are alike
+    near: Float[Array, "*tag height width"]  # log density of its range by the anchor
 
 
 class TagAttentionState(eqx.Module):
@@ -91,6 +99,8 @@ def paper_limit() -> dict[str, Any]:
         "anchor_limit": nothing,
         "anchor_rate": nothing,
         "foreground_weight": nothing,
+        "rivalry": nothing,
+        "rest_doubt": 0.0,
         "cut_rule": "cdf_corner",
         "cut_width": 1e-7,
     }
@@ -145,9 +155,12 @@ class TagAttention(AbstractTracer):
     log_anchor_rate: Float[Array, ""]
     anchor_unseen: Float[Array, ""]
     log_foreground_weight: Float[Array, ""]
+    log_rivalry: Float[Array, ""]
 
     cell: int = eqx.field(static=True)
     max_speed_m_s: float = eqx.field(static=True)
+    rest_doubt: float = eqx.field(static=True)
+    rest_nats: float = eqx.field(static=True)
     box_tail: float = eqx.field(static=True)
     doubled_angle: bool = eqx.field(static=True)
     anchor_bins: int = eqx.field(static=True)
@@ -199,8 +212,11 @@ class TagAttention(AbstractTracer):
         anchor_rate: float = 0.3,
         anchor_unseen: float = -1.0,
         foreground_weight: float = 3.0,
+        rivalry: float = 16.0,
         cell: int = 6,
         max_speed_m_s: float = 3.0,
+        rest_doubt: float = 0.0,
+        rest_nats: float = 4.0,
         box_tail: float = 0.02,
         doubled_angle: bool = True,
         anchor_bins: int = 120,
@@ -242,8 +258,11 @@ class TagAttention(AbstractTracer):
                 share of it that counts as evidence of the pixel's identity.
             anchor_drift_m: error of the radio's distance that adds up, per frame.
             foreground_weight: pull of what stands before the background.
+            rivalry: log odds that a pixel of another tag's object counts less, at most; infinite where a thing has one tag.
             cell: cell of the segmentation grid, pixels of the working resolution.
             max_speed_m_s: a faster change of a pixel's distance is another surface.
+            rest_doubt, rest_nats: log odds that a claim loses while rest explains all of the tag's reads; against how much
+                evidence of the reads that it has moved, in nats, 1/e of that is left.
             box_tail: share of the mask that the box may leave out on each side.
             doubled_angle: take phases modulo pi in the coherent term (readers with pi flips).
             anchor_bins: number of ranges of 0.1 m that the anchor tells apart.
@@ -278,8 +297,9 @@ class TagAttention(AbstractTracer):
         self.log_anchor_depth, self.log_anchor_limit = stored_log(anchor_depth_m), stored_log(anchor_limit)
         self.log_anchor_drift, self.log_anchor_rate = stored_log(anchor_drift_m), stored_log(anchor_rate)
         self.anchor_unseen = jnp.asarray(anchor_unseen, jnp.float32)
-        self.log_foreground_weight = stored_log(foreground_weight)
+        self.log_foreground_weight, self.log_rivalry = stored_log(foreground_weight), stored_log(rivalry)
         self.cell, self.max_speed_m_s = cell, max_speed_m_s
+        self.rest_doubt, self.rest_nats = rest_doubt, rest_nats
         self.box_tail, self.doubled_angle = box_tail, doubled_angle
         self.anchor_bins, self.cut_rule = anchor_bins, cut_rule
 
@@ -345,9 +365,13 @@ class TagAttention(AbstractTracer):
 
         phases = carry_phases(state.phases, backward_px, followed)
 
-        log_odds, mask, place, anchor, phases = jax.vmap(self._trace_tag, in_axes=(None, 0, 0, 0, 0, 0, 0))(
-            view, carried, frame.radio, frame.reads, state.place, state.anchor, phases
+        belief, anchor, phases = jax.vmap(self._believe, in_axes=(None, 0, 0, 0, 0, 0))(
+            view, carried, frame.radio, frame.reads, state.anchor, phases
         )
+        log_odds = belief.log_odds
+        rivals = soft_clip(rival_log_odds(belief.held + belief.near), jnp.exp(self.log_rivalry))
+        moved = jnp.max(phases.moved, axis=1)
+        mask, place = jax.vmap(self._locate, in_axes=(None, 0, 0, 0, 0))(view, belief, rivals, moved, state.place)
         background = remember(state.background, distance, valid, log_odds)
         out = describe(mask, place.centre_m, step_m, recent, place.confidence, self.box_tail)
         # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
@@ -358,17 +382,16 @@ class TagAttention(AbstractTracer):
     def finish(self, state: TagAttentionState) -> TagAttentionState:
         return state
 
-    def _trace_tag(
+    def _believe(
         self,
         view: View,
         carried: Float[Array, "height width"],
         radio: RadioWindow,
         reads: PhaseReads,
-        place: Place,
         anchor: Anchor,
         phases: PhaseMemory,
-    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"], Place, Anchor, PhaseMemory]:
-        """One tag's update: log odds, soft mask, place, anchor, phases; radio, reads, anchor, phases per antenna."""
+    ) -> tuple[Belief, Anchor, PhaseMemory]:
+        """What one tag's radio says of every pixel by now; radio, reads, anchor, phases per antenna."""
         valid = view.valid
         evidence, gate = self._weighed_evidence(view, radio, reads)
         anchor, nears = of_each_antenna(
@@ -390,24 +413,40 @@ class TagAttention(AbstractTracer):
 
         refined = refine(pooled[..., 0])
         spread = diffuse(pooled[..., 0], view.affinity, jax.nn.sigmoid(self.logit_diffusion))
-        held = refine(spread)
+        return Belief(refined, refine(spread), near), anchor, phases
+
+    def _locate(
+        self,
+        view: View,
+        belief: Belief,
+        rivals: Float[Array, "height width"],
+        moved: Float[Array, ""],
+        place: Place,
+    ) -> tuple[Float[Array, "height width"], Place]:
+        """One tag's soft mask and place, by what is believed of it and of the other tags."""
+        valid, held, near = view.valid, belief.held, belief.near
+        # Where nothing else can be its object, a tag shares one with its rivals. A maximum has the gradient 0 / 0 where it
+        # is computed once more and rounded otherwise, as in the backward pass; and far from even odds it has none.
+        elsewhere = jax.lax.stop_gradient(jnp.max(jnp.where(valid, held + near - rivals, -9.0)))
+        rivals = rivals * jax.nn.sigmoid(elsewhere)
         # What carries the tag moves, so it stands before what has always been there; but where it began it is itself
         # what is remembered, and evidence outweighs that.
         front = jnp.where(view.front < 0, view.front * jax.nn.sigmoid(-held), view.front)
-        shown = held + near + jnp.exp(self.log_foreground_weight) * front
+        shown = held + near + jnp.exp(self.log_foreground_weight) * front - rivals
         predicted = place.centre_m + place.velocity_m_s * view.elapsed_s * jax.nn.sigmoid(self.logit_inertia)
         mask, centre = self._cut(view, shown, predicted, place)
-        told = refined + jax.nn.sigmoid(self.logit_range_share) * near
+        told = belief.log_odds + jax.nn.sigmoid(self.logit_range_share) * near
         sure = jnp.max(jnp.where((mask > 0.5) & valid, told, -9.0))
-        confidence = jax.nn.sigmoid(sure)
+        doubt = self.rest_doubt * jnp.exp(-moved / self.rest_nats)
+        confidence = jax.nn.sigmoid(sure - doubt)
         both = (place.confidence > 0.5) & (confidence > 0.5)
         move = jnp.clip((centre - place.centre_m) / view.elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
         velocity = jnp.where(both, 0.5 * place.velocity_m_s + 0.5 * move, 0.0)
         away = jnp.sum(jnp.square(view.points_m - centre[None, None]), axis=-1)
         radius = safe_sqrt(jnp.sum(mask * away) / jnp.maximum(jnp.sum(mask), 1e-6))
         rate = jax.nn.sigmoid(self.logit_size_rate)
-        held = jnp.where(confidence > 0.5, (1.0 - rate) * place.radius_m + rate * radius, place.radius_m)
-        return refined, mask, Place(centre, velocity, confidence, held), anchor, phases
+        size_m = jnp.where(confidence > 0.5, (1.0 - rate) * place.radius_m + rate * radius, place.radius_m)
+        return mask, Place(centre, velocity, confidence, size_m)
 
     def _phase_evidence(
         self, view: View, ranging: Ranging, reads: PhaseReads, phases: PhaseMemory

@@ -16,6 +16,7 @@ import synthetic_clips as synthetic
 
 from tagjax.evaluation.evaluate import (
     ScoreSettings,
+    _tags,
     box_to_picture,
     evaluate_recording,
     mask_to_picture,
@@ -55,6 +56,17 @@ def test_three_tags_in_groups_of_two_keep_their_order() -> None:
     assert said.mask.shape[0] == 3
     np.testing.assert_allclose(said.mask[0], said.mask[2], rtol=1e-5)
     assert np.abs(said.mask[0] - said.mask[1]).max() > 0.1
+
+
+def test_a_group_is_filled_up_with_tags_that_are_never_heard() -> None:
+    """Not with one of its own once more, which would compete with itself."""
+    frames = synthetic.load(synthetic.recording(8), 0, 8, epcs=["tag-b", "tag-a", "tag-b"]).frames
+    last = _tags(frames, 2, 2)
+    np.testing.assert_array_equal(last.radio.relative_m[:, 0], frames.radio.relative_m[:, 2])
+    np.testing.assert_array_equal(last.reads.valid[:, 0], frames.reads.valid[:, 2])
+    assert np.isinf(last.radio.std_m[:, 1]).all()
+    assert not np.asarray(last.radio.relative_m[:, 1]).any()
+    assert not np.asarray(last.reads.valid[:, 1]).any()
 
 
 def test_the_object_is_found_named_and_outlined() -> None:

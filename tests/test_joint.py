@@ -102,9 +102,10 @@ def _in_double(tree):
 def test_the_loss_moves_as_its_gradient_says(clip):
     """Flow weights, alpha, beta, v0 and the gate's width through one objective, against central differences in x64."""
     with jax.enable_x64(True):
-        # By design no gradient goes through the place of a frame ago or the centre that mean shift finds: the prior that
-        # reads the one and the extent around the other are left out here.
-        tracer = TagAttention(cell=4, prior_weight=1e-12, extent_m=1e3, v0_m_s=0.3, gate_width_m_s=0.1)
+        # By design no gradient goes through the place of a frame ago, the centre that mean shift finds, or how far rivalry
+        # counts: the prior that reads the first, the extent around the second and rivalry are left out here.
+        left_out = {"prior_weight": 1e-12, "extent_m": 1e3, "rivalry": 1e-12}
+        tracer = TagAttention(cell=4, v0_m_s=0.3, gate_width_m_s=0.1, **left_out)
         model = _in_double(JointModel(tracer, _panning_network(), 0.1, LOSS))
         frames, camera = _in_double(clip.frames), _in_double(clip.camera)
         slope = jnp.linspace(0.0, 0.6, frames.depth_m.shape[2])

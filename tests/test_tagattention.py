@@ -17,9 +17,9 @@ from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
 from tagjax.tracer import Camera, Frame, describe, trace
 
 
-def _learnable():
+def _learnable(**changed):
     """For objects that move at a few dm/s and are seen without noise: a narrow kernel, a weak place prior."""
-    return TagAttention(cell=4, alpha_m2=1e-3, prior_weight=3.0)
+    return TagAttention(**{"cell": 4, "alpha_m2": 1e-3, "prior_weight": 3.0, **changed})
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_the_learnable_tracer_finds_both_objects(clip, said):
 def test_phases_alone_name_both_objects(clip):
     """Where the radio's distances are unknown, as between reads that are too few to unwrap, the raw phases still speak."""
     unknown = eqx.tree_at(lambda f: f.radio.std_m, clip.frames, jnp.full_like(clip.frames.radio.std_m, jnp.inf))
-    tracer = TagAttention(cell=4, alpha_m2=1e-3, prior_weight=3.0, phase_weight=1.0)
+    tracer = _learnable(phase_weight=1.0)
     spoken = eqx.filter_jit(trace)(tracer, clip.camera, unknown)
     for tag, (x0, y0, x1, y1) in enumerate(synthetic.BOXES.values()):
         covered = np.asarray(spoken.mask[-1, tag])
@@ -72,8 +72,10 @@ def test_step_follows_the_objects_distance(clip, said):
         np.testing.assert_allclose(np.asarray(out.step_m[-8:, tag, 0]), expected, atol=0.02)
 
 
-def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip, said):
-    """Any number of tags and antennas by vmap: each tag is traced as if it were alone, by what was heard of it."""
+def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip):
+    """Without rivalry any number of tags and antennas are as one: each tag is traced by what was heard of it alone."""
+    tracer = _learnable(rivalry=1e-12)
+    said = eqx.filter_jit(trace)(tracer, clip.camera, clip.frames)
     alone = load_clip(synthetic.recording(24), 0, 24, stride=1, epcs=[clip.epcs[1]])
     frames = alone.frames
     twice = lambda part: jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf], axis=2), part)  # noqa: E731
@@ -87,9 +89,48 @@ def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip, said):
         ),
     )
     camera = eqx.tree_at(lambda c: c.antennas_m, alone.camera, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5]]))
-    single = eqx.filter_jit(trace)(_learnable(), camera, deaf)
+    single = eqx.filter_jit(trace)(tracer, camera, deaf)
     np.testing.assert_allclose(said.mask[:, 1], single.mask[:, 0], atol=1e-4)
     np.testing.assert_allclose(said.step_m[:, 1, 0], single.step_m[:, 0, 0], atol=1e-4)
+
+
+def test_two_tags_of_one_thing_both_find_it(clip):
+    """Rivalry tells tags of different things apart; it keeps none from a thing that it shares."""
+    frames = eqx.tree_at(
+        lambda f: (f.radio, f.reads),
+        clip.frames,
+        jax.tree.map(lambda leaf: leaf[:, jnp.asarray([1, 1, 0])], (clip.frames.radio, clip.frames.reads)),
+    )
+    out = eqx.filter_jit(trace)(_learnable(), clip.camera, frames)
+    for tag, (x0, y0, x1, y1) in enumerate(list(synthetic.BOXES.values())[label] for label in (1, 1, 0)):
+        covered = np.asarray(out.mask[-1, tag])
+        assert covered[y0 : y1 + 1, x0 : x1 + 1].mean() > 0.6
+        assert covered.sum() - covered[y0 : y1 + 1, x0 : x1 + 1].sum() < 0.3 * covered.sum()
+        assert bool(out.found[-1, tag])
+
+
+def test_the_reads_tell_that_a_tag_has_moved(clip):
+    """Evidence against rest grows for a tag that moves, not for one whose phases never change, and raises doubt of it."""
+    reads = clip.frames.reads
+    constant = 1.0 + reads.channel[:, 1].astype(jnp.float32)
+    rests = eqx.tree_at(lambda f: f.reads.phase_rad, clip.frames, reads.phase_rad.at[:, 1].set(constant))
+
+    @eqx.filter_jit
+    def run(tracer):
+        first = jax.tree.map(lambda leaf: leaf[0], rests)
+        return jax.lax.scan(
+            lambda state, frame: tracer.step(clip.camera, state, frame), tracer.init(clip.camera, first), rests
+        )
+
+    state, doubted = run(_learnable(rest_doubt=5.0))
+    _, believed = run(_learnable(rest_doubt=0.0))
+    moved = np.asarray(state.phases.moved[:, 0])
+    assert moved[0] > 20.0
+    assert moved[1] < 1.0
+    assert bool(jnp.all(state.phases.moving <= state.phases.moved))
+    # The radio's path still says that it moves, as it might by mistake; doubt takes five from the log odds of that.
+    gap = jax.scipy.special.logit(believed.confidence[-1]) - jax.scipy.special.logit(doubted.confidence[-1])
+    np.testing.assert_allclose(gap, [0.0, 5.0 * np.exp(-moved[1] / 4.0)], atol=0.3)
 
 
 def _side_by_side() -> tuple[Camera, Frame, np.ndarray]:

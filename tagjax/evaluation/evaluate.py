@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from ..recording import Recording, RecordingError
+from ..rf.reads import RadioWindow
 from ..tracer import AbstractTracer, Camera, Frame, Trace
 from . import metrics
 from .metrics import FrameScores, Scores
@@ -113,12 +114,17 @@ def _step(tracer: AbstractTracer, camera: Camera, state: Any, frame: Frame) -> t
     return tracer.step(camera, state, frame)
 
 
-def _tags(frame: Frame, chosen: np.ndarray) -> Frame:
-    """One frame (leading time axis kept) with only the chosen tags."""
-    pick = lambda leaf: leaf[:, chosen]  # noqa: E731
-    return eqx.tree_at(
-        lambda f: (f.radio, f.reads), frame, (jax.tree.map(pick, frame.radio), jax.tree.map(pick, frame.reads))
-    )
+def _tags(frame: Frame, first: int, size: int) -> Frame:
+    """One frame (leading time axis kept) with only `size` of the tags; beyond the last one they are never heard."""
+    num_tags = frame.radio.std_m.shape[1]
+    chosen = np.arange(first, first + size)
+    there = chosen < num_tags
+    pick = lambda leaf: leaf[:, chosen.clip(max=num_tags - 1)]  # noqa: E731
+    radio, reads = jax.tree.map(pick, frame.radio), jax.tree.map(pick, frame.reads)
+    heard = there[None, :, None, None]
+    radio = RadioWindow(jnp.where(heard, radio.relative_m, 0.0), jnp.where(heard, radio.std_m, jnp.inf))
+    reads = eqx.tree_at(lambda one: one.valid, reads, reads.valid & heard)
+    return eqx.tree_at(lambda f: (f.radio, f.reads), frame, (radio, reads))
 
 
 def trace_recording(
@@ -134,7 +140,8 @@ def trace_recording(
 
     `load(recording, start, stop, epcs=...)` gives a `Clip`. Pieces of `frames_at_once` frames are read one after the
     other with the tracer's state carried across, so that memory does not grow with the recording; tags go through in
-    groups of `tags_at_once`, the last one filled up by repetition, so that one compilation does for all.
+    groups of `tags_at_once`, the last one filled up with silent ones, so that one compilation does for all. Tags compete for
+    pixels within their group.
     """
     settings = settings or ScoreSettings()
     first, last = frames or (0, recording.num_frames)
@@ -145,13 +152,13 @@ def trace_recording(
     if not epcs:
         raise RecordingError(f"{recording.name}: no tag to trace. The recording holds no read, or epcs is empty.")
     size = min(settings.tags_at_once, len(epcs))
-    groups = [np.arange(start, start + size).clip(max=len(epcs) - 1) for start in range(0, len(epcs), size)]
+    groups = range(0, len(epcs), size)
     states: list[Any] = [None] * len(groups)
     for start in range(first, last, settings.frames_at_once):
         stop = min(start + settings.frames_at_once, last)
         overlap = int(start > first)  # a clip's first frame has no flow: read it again, with the frame before
         clip = load(recording, start - overlap, stop, epcs=list(epcs))
-        parts = [_tags(clip.frames, group) for group in groups]
+        parts = [_tags(clip.frames, group, size) for group in groups]
         for index in range(overlap, stop - start + overlap):
             said = []
             for number, part in enumerate(parts):
