@@ -14,6 +14,9 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Most of the time of a run is compilation: what XLA saves in the runs of tests, it spends several times over before.
 jax.config.update("jax_disable_most_optimizations", True)
+# Calls run on the thread that makes them. On the pool, two at once (a test's and that of a pipeline which is still reading
+# ahead) can each hold a thread that the other's parts wait for: with two cores there are no more.
+jax.config.update("jax_cpu_enable_async_dispatch", False)
 if jax.__version_info__ < (0, 11):  # XLA ends a process that gives it a flag it does not know
     # The older emitters compile a large graph in 22 s where the present ones take 56. Programs that tests start inherit it.
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -182,3 +183,14 @@ def test_the_true_distances_may_stand_in_for_the_radio(recording: Recording) -> 
     elsewhere = dataclasses.replace(recording, reads=turned, antennas_m=np.zeros((2, 3)))
     with pytest.raises(RecordingError, match="true ranges are to antenna 1 and the clip's are to antenna 2"):
         load_clip(elsewhere, 3, 12, **SMALL, estimator="truth")
+
+
+def test_clips_that_threads_load_at_once_are_those_of_one_after_the_other():
+    recording = synthetic.recording(12)
+    load = lambda start: load_clip(recording, start, start + 6, stride=2)  # noqa: E731
+    starts = [0, 2, 4, 6] * 2
+    with ThreadPoolExecutor(4) as threads:
+        at_once = list(threads.map(load, starts))
+    for start, found in zip(starts, at_once, strict=True):
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(load(start)), strict=True):
+            np.testing.assert_array_equal(one, other)

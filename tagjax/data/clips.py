@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Sequence
 from typing import Literal
@@ -27,6 +28,9 @@ Antennas = tuple[int, ...] | Literal["all"] | None
 """Which antennas' reads are used, counted from 1; None is the one with the most."""
 
 _TRUTH_STD_M = 1e-3
+
+_one_radio_at_a_time = threading.Lock()
+"""XLA runs a call on a thread of the pool that its parts wait for: on two cores, two calls at once can wait for each other."""
 
 
 class Clip(eqx.Module):
@@ -151,12 +155,13 @@ def load_clip(
 
     def heard(epc: str, antenna: int) -> tuple[RadioWindow, PhaseReads]:
         buffer = host_reads(recording.reads, epc, origin_ns, length=length, antenna=antenna)
-        if estimator == "truth":
-            radio = _true_window(recording, epc, window, antenna)
-        else:
-            radio = radio_windows(buffer, time_s, window, estimator)
-        held = radio, _window_reads(buffer, time_s, window, max_reads)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[start:stop], held)
+        with _one_radio_at_a_time:
+            if estimator == "truth":
+                radio = _true_window(recording, epc, window, antenna)
+            else:
+                radio = radio_windows(buffer, time_s, window, estimator)
+            held = radio, _window_reads(buffer, time_s, window, max_reads)
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[start:stop], held)
 
     def stacked(parts):
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *parts)
