@@ -122,13 +122,16 @@ def test_the_reads_tell_that_a_tag_has_moved(clip):
             lambda state, frame: tracer.step(clip.camera, state, frame), tracer.init(clip.camera, first), rests
         )
 
-    state, out = run(_learnable(rest_doubt=100.0))
+    state, doubted = run(_learnable(rest_doubt=5.0))
+    _, believed = run(_learnable())
     moved = np.asarray(state.phases.moved[:, 0])
     assert moved[0] > 20.0
     assert moved[1] < 1.0
     assert bool(jnp.all(state.phases.moving <= state.phases.moved))
-    # The radio's path still says that both move, as it might by mistake: doubt takes the claim from the one that rests.
-    assert out.found[-1].tolist() == [True, False]
+    # The radio's path still says that both move, as it might by mistake: doubt takes five from the log odds of the one that
+    # rests.
+    gap = jax.scipy.special.logit(believed.confidence[-1]) - jax.scipy.special.logit(doubted.confidence[-1])
+    np.testing.assert_allclose(gap, [0.0, 5.0 * np.exp(-moved[1] / 4.0)], atol=0.3)
 
 
 def _side_by_side() -> tuple[Camera, Frame, np.ndarray]:

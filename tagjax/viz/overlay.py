@@ -23,6 +23,9 @@ PALETTE_RGB = (
 _SIZE = 0.45
 """Of letters, in OpenCV's measure."""
 
+_LINE = 14
+"""Pixels from one line of them to the next."""
+
 MIN_WIDTH = 480
 """Smaller pictures are enlarged by a whole factor, so that outlines and names stay readable."""
 
@@ -70,10 +73,6 @@ def draw_overlay(
         _text(picture, text, place, shade)
         taken.append(_extent(text, place))
     return picture
-
-
-_LINE = 14
-"""Pixels from one line of text to the next."""
 
 
 def _extent(text: str, place: tuple[int, int]) -> tuple[int, int, int, int]:
