@@ -18,6 +18,7 @@ PACKAGE = ROOT / "tagjax"
 LAYERS = {
     "_types": 0,
     "_numerics": 0,
+    "_compile": 0,
     "arrays_file": 0,
     "recording": 1,
     "geometry": 1,

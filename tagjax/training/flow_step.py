@@ -11,6 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PyTree, UInt8, UInt32
 
+from .._compile import large_program
 from ..flow.losses import (
     FlowLossSettings,
     level_terms,
@@ -107,7 +108,7 @@ def batch_loss(
     return weighted(found, settings), found
 
 
-@eqx.filter_jit(donate="all-except-first")
+@large_program(level=1, donate="all-except-first")
 def _update(
     pictures: tuple[UInt8[Array, "batch 2 rows columns 3"], UInt8[Array, "batch 2 height width 3"]],
     state: FlowTrainState,

@@ -19,6 +19,7 @@ import optax
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, PyTree, UInt32
 
+from .._compile import large_program
 from ..tracer import AbstractTracer, Camera, Frame
 from .devices import AXIS, copied_here, mesh_here, spread_here
 from .joint import Flow, JointModel, network_flow
@@ -62,7 +63,7 @@ def make_joint_optimizer(
     return optax.partition({"tracer": tracer, "network": network}, labels)
 
 
-@eqx.filter_jit
+@large_program()
 def clip_gradient(
     model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
@@ -129,7 +130,7 @@ def _term_gradients(
     return total, logged
 
 
-@eqx.filter_jit
+@large_program()
 def _gradients_side_by_side(
     model: Model, camera: Camera, frames: Frame, keys: UInt32[Array, "clip 2"], settings: ObjectiveSettings
 ) -> tuple[PyTree, dict[str, Float[Array, " clip"]]]:
@@ -183,7 +184,7 @@ def _gradients(
                 yield jax.tree.map(lambda leaf, place=place: leaf[place], found)
 
 
-@eqx.filter_jit
+@large_program()
 def clip_loss(
     model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> dict[str, Float[Array, ""]]:
