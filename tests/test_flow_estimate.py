@@ -13,6 +13,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -482,7 +483,7 @@ def test_packaged_weights_are_found_by_name_and_by_network(packaged):
     assert make_flow("pyramid") is flow
     fine = make_flow("pyramid_fine")
     assert isinstance(fine, NetworkFlow)
-    _same(fine.network, build({**SETTINGS, "seed": 5, "octaves": [-1, 0, 1, 2]}))
+    _same(fine.network, build({**SETTINGS, "seed": 5, "octaves": [-1, 0, 1, 2], "medians": 2}))
     assert make_flow("pyramid_fine") is fine
     assert flow_key("pyramid_fine") != flow_key("pyramid")
     assert make_flow("pyramid") is flow
@@ -527,6 +528,32 @@ def test_kept_flow_is_that_of_the_weights(stored, tmp_path):
         pair_flow(recording, 1, 6, str(tmp_path / "none.npz"))
 
 
+def test_a_flow_at_rest_is_the_flow_where_rest_explains_less():
+    """Noise around a square that moves: there DIS is kept, elsewhere nothing is; and the key tells the two apart."""
+    rng = np.random.default_rng(0)
+    still = cv2.GaussianBlur(rng.uniform(0, 255, (96, 128)), (0, 0), 2.0)
+    square = 3 * cv2.GaussianBlur(rng.uniform(-128, 128, (30, 30)), (0, 0), 1.5) + 128
+    pictures = []
+    for shift in (0, 3, 6):
+        picture = 3 * (still - still.mean()) + 128 + rng.normal(0, 2, still.shape)
+        picture[30:60, 30 + shift : 60 + shift] = square
+        pictures.append(np.repeat(np.clip(picture, 0, 255).astype(np.uint8)[..., None], 3, axis=-1))
+    plain, rested = make_flow("dis"), make_flow("dis+rest")
+    here, there = pictures[:2]
+    flow, kept = plain(here, there), rested(here, there)
+    np.testing.assert_array_equal(kept[36:54, 36:54], flow[36:54, 36:54])
+    around = np.ones((96, 128), bool)
+    around[16:74, 16:77] = False
+    assert np.any(kept[around] != 0, axis=-1).mean() < 0.02 < np.any(flow[around] != 0, axis=-1).mean()
+    np.testing.assert_array_equal(rested(here / np.float32(255), there / np.float32(255)), kept)
+    for (ahead, back), one, other in zip(flow_along(rested, iter(pictures)), pictures[:-1], pictures[1:], strict=True):
+        np.testing.assert_array_equal(ahead, rested(one, other))
+        np.testing.assert_array_equal(back, rested(other, one))
+    assert flow_key("dis+rest").startswith("dis+rest")
+    with pytest.raises(ValueError, match=r"Unknown optical flow 'diss'.*\+rest may follow"):
+        make_flow("diss+rest")
+
+
 def test_clips_take_any_named_flow(stored, tmp_path):
     path = tmp_path / "w.npz"
     save_weights(path, small_network(1, 30.0), {"flow": SETTINGS})
@@ -538,11 +565,13 @@ def test_clips_take_any_named_flow(stored, tmp_path):
     np.testing.assert_allclose(clip.frames.forward_px[2], expected, atol=1e-6)
 
 
-def test_the_fine_pyramid_differs_by_its_octaves_only():
+@pytest.mark.parametrize("name", sorted(VARIANTS))
+def test_a_variant_differs_by_its_octaves_and_medians_only(name):
     with initialize_config_dir(str(CONF.parent), version_base="1.3"):
-        plain, fine = (compose("train_flow", [f"flow={name}"]).flow for name in ("pyramid", "pyramid_fine"))
-    assert {**fine, "octaves": plain.octaves} == plain
-    assert {"pyramid_fine": ("pyramid", {"octaves": tuple(fine.octaves)})} == VARIANTS
+        plain, fine = (compose("train_flow", [f"flow={which}"]).flow for which in ("pyramid", name))
+    assert {**fine, "octaves": plain.octaves, "medians": plain.medians} == plain
+    changes = {"octaves": tuple(fine.octaves), "medians": fine.medians}
+    assert VARIANTS[name] == ("pyramid", changes)
 
 
 @pytest.mark.parametrize("name", [*sorted(CLASSICAL), "pyramid"])

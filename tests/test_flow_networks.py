@@ -26,6 +26,7 @@ from tagjax.flow.flownet import FlowNetC, FlowNetS, strided_cost_volume
 from tagjax.flow.network import AbstractFlowNetwork, flow_both_ways
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall, halve, look_up, look_up_products
+from tagjax.image.median import median_filter
 
 CONF = Path(__file__).parents[1] / "conf" / "flow"
 
@@ -34,7 +35,7 @@ PUBLISHED: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "flownet_c": FlowNetC,
     "raft_small": RAFTSmall,
     "pyramid": PyramidFlow,
-    "pyramid_fine": lambda: PyramidFlow(octaves=(-1, 0, 1, 2)),
+    "pyramid_fine": lambda: PyramidFlow(octaves=(-1, 0, 1, 2), medians=2),
 }
 TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "flownet_s": lambda: FlowNetS(width=1 / 64),
@@ -42,7 +43,7 @@ TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "raft_small": lambda: RAFTSmall(updates=2, levels=2, radius=1),
     "raft_small_lean": lambda: RAFTSmall(updates=2, levels=2, radius=1, all_pairs=False),
     "pyramid": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,))),
-    "pyramid_fine": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,)), octaves=(-1, 0, 1, 2)),
+    "pyramid_fine": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,)), octaves=(-1, 0, 1, 2), medians=1),
 }
 
 
@@ -251,6 +252,24 @@ def test_octaves_of_the_pyramid_go_on_from_one_another(octaves):
     assert flows[-1].shape == (side, side, 2)
 
 
+@pytest.mark.parametrize("octaves", [(0,), (0, 1)])
+def test_the_last_flow_is_median_filtered_and_no_other(octaves):
+    settings = {"widths": (6, 8), "radii": (1, 2), "iterations": (1, 1), "decoder_widths": ((8,), (8,)), "seed": 3}
+    plain, filtered = (
+        _jitted()(_lively(PyramidFlow(**settings, octaves=octaves, medians=count)), *_pictures()) for count in (0, 2)
+    )
+    for one, other in zip(plain[:-1], filtered[:-1], strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(filtered[-1], median_filter(median_filter(plain[-1], 5), 5))
+    assert not np.array_equal(plain[-1], filtered[-1])
+
+
+def _lively(network: PyramidFlow) -> PyramidFlow:
+    """The network with heads whose flow differs from pixel to pixel."""
+    heads = lambda n: [d.head.weight for d in n.decoders]  # noqa: E731
+    return eqx.tree_at(heads, network, replace_fn=lambda weight: 100 * weight)
+
+
 @pytest.mark.slow
 def test_a_raft_update_answers_for_its_own_correction_only():
     network = _tiny("raft_small")
@@ -294,6 +313,7 @@ def test_raft_takes_pictures_smaller_than_its_pyramid():
         lambda: PyramidFlow(octaves=(0, 2)),
         lambda: PyramidFlow(octaves=(1, 2)),
         lambda: PyramidFlow(octaves=(0, -1)),
+        lambda: PyramidFlow(medians=-1),
     ],
 )
 def test_settings_that_make_no_network_are_refused(make):

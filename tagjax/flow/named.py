@@ -1,9 +1,12 @@
-"""Flows by name: `zero`, OpenCV's, and networks with their weights; and the flow along a video."""
+"""Flows by name: `zero`, OpenCV's, and networks with their weights; any of them at rest where rest explains the pictures
+as well; and the flow along a video.
+"""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +16,8 @@ import numpy as np
 from . import opencv
 from .estimate import NetworkFlow
 from .opencv import FlowFunction
-from .pictures import check_pictures
+from .pictures import as_bytes, check_pictures
+from .stillness import GENTLE_BLOCK_PX, GENTLE_GAIN, settled
 from .weights import find_weights, load_network, packaged_weights, weights_about
 
 
@@ -25,18 +29,49 @@ class ZeroFlow:
         return np.zeros((*one.shape[:2], 2), np.float32)
 
 
+class SettledFlow:
+    """Another flow, zero where rest explains the pictures as well (`settled`, gently): for a camera that stands."""
+
+    def __init__(self, flow: FlowFunction):
+        self.flow = flow
+
+    def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return self._settled(np.asarray(self.flow(first, second)), first, second)
+
+    def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Flow forward and backward between neighbouring pictures, as `flow_along` of the other gives it."""
+        pictures, again = itertools.tee(pictures)
+        for (forward, backward), (one, other) in zip(
+            flow_along(self.flow, pictures), itertools.pairwise(again), strict=True
+        ):
+            yield self._settled(forward, one, other), self._settled(backward, other, one)
+
+    @staticmethod
+    def _settled(flow_px: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        here, there = map(as_bytes, check_pictures(first, second))
+        return settled(flow_px, here, there, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
+
+
 CLASSICAL: dict[str, Callable[[], FlowFunction]] = {"zero": ZeroFlow, **opencv.FLOWS}
 """Flows that learn nothing, by name."""
 
-VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {"pyramid_fine": ("pyramid", {"octaves": (-1, 0, 1, 2)})}
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "pyramid_mid": ("pyramid", {"octaves": (-1, 0, 1), "medians": 2}),
+    "pyramid_fine": ("pyramid", {"octaves": (-1, 0, 1, 2), "medians": 2}),
+}
 """Packaged weights with other settings of their network, by name."""
+
+AT_REST = "+rest"
+"""What the name of a flow ends with that is to be `SettledFlow`'s."""
 
 
 def make_flow(name: str) -> FlowFunction:
     """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
 
-    Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
+    With `AT_REST` after it, the same as `SettledFlow`. Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
     """
+    if name.endswith(AT_REST):
+        return SettledFlow(make_flow(name.removesuffix(AT_REST)))
     if name in CLASSICAL:
         return CLASSICAL[name]()
     path = _weights(name)
@@ -46,13 +81,18 @@ def make_flow(name: str) -> FlowFunction:
 def flow_key(name: str) -> str:
     """A name for what `make_flow(name)` computes that is a file name, too: weights go by their digest.
 
-    Other weights have another key, wherever they lie. Errors as of `make_flow`.
+    Other weights have another key, wherever they lie, and so have other settings. Errors as of `make_flow`.
     """
+    if name.endswith(AT_REST):
+        return f"{flow_key(name.removesuffix(AT_REST))}{AT_REST}-{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"
     if name in CLASSICAL:
         return name
     path = _weights(name)
     key = _weights_key(str(path), _stamp(path))
-    return f"{key}-{name}" if name in VARIANTS else key
+    if name not in VARIANTS:
+        return key
+    changes = hashlib.sha256(repr(sorted(VARIANTS[name][1].items())).encode()).hexdigest()
+    return f"{key}-{name}-{changes[:8]}"
 
 
 def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -60,7 +100,7 @@ def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[t
 
     A network sees each picture once. Errors as of `check_pictures`.
     """
-    if isinstance(flow, NetworkFlow):
+    if isinstance(flow, NetworkFlow | SettledFlow):
         yield from flow.along(pictures)
         return
     before = None
@@ -78,7 +118,7 @@ def _weights(name: str) -> Path:
     there = ", ".join(packaged_weights()) or "none"
     raise ValueError(
         f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({there}), "
-        "or the path of an .npz file of weights."
+        f"or the path of an .npz file of weights; {AT_REST} may follow."
     )
 
 

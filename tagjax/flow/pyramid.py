@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from ..image.median import median_filter
 from ..image.warp import gather
 from ._layers import Conv, convex_upsample, enlarge, enlarge_flow, rectify, shrink, space_to_depth
 from .cost_volume import cost_volume, normalise_features
@@ -21,6 +22,7 @@ from .network import AbstractFlowNetwork, Levels
 
 _FINEST = 4
 _HIDDEN = 32
+_MEDIAN_PX = 5
 _CONVEX = 2
 """The last step's learned upsampling; the rest is bilinear: by four at once would take as long as all the costs."""
 
@@ -68,6 +70,9 @@ class PyramidFlow(AbstractFlowNetwork):
     `octaves` are the sizes of the picture, as powers of two, that the same weights are laid on in turn, each going on
     from the flow of the one before: all levels on the smallest, the finest two where the picture is not enlarged, the
     finest alone where it is. -1 reaches twice as far; each above 0 is twice as exact and takes four times as long.
+
+    `medians` is how often the flow is median filtered over 5 x 5 pixels in the end (Sun et al., CVPR 2010). Filtered
+    between the octaves, too, large motion would gain, and things of a few pixels lose.
     """
 
     encoders: tuple[tuple[Conv, Conv], ...]
@@ -75,6 +80,7 @@ class PyramidFlow(AbstractFlowNetwork):
     upsampler: Conv
     iterations: tuple[int, ...] = eqx.field(static=True, converter=tuple)
     octaves: tuple[int, ...] = eqx.field(static=True, converter=tuple)
+    medians: int = eqx.field(static=True)
     divisor: int = eqx.field(static=True)
 
     def __init__(
@@ -84,6 +90,7 @@ class PyramidFlow(AbstractFlowNetwork):
         iterations: Sequence[int] | None = None,
         decoder_widths: Sequence[Sequence[int]] = ((32, 32), (64, 64), (64, 64), (64, 64)),
         octaves: Sequence[int] = (0,),
+        medians: int = 0,
         *,
         seed: int = 0,
     ):
@@ -102,6 +109,8 @@ class PyramidFlow(AbstractFlowNetwork):
             or not octaves[0] <= 0 <= octaves[-1]
         ):
             raise ValueError(f"octaves are {tuple(octaves)}; expected neighbouring ones with 0 among them, rising.")
+        if medians < 0:
+            raise ValueError(f"medians is {medians}; expected how often the flow is filtered, 0 for never.")
         count = len(widths)
         keys = jax.random.split(jax.random.key(seed), 3 * count + 1)
         first = Conv(3 * _FINEST**2, widths[0], key=keys[0])
@@ -115,7 +124,7 @@ class PyramidFlow(AbstractFlowNetwork):
         )
         self.iterations = tuple(iterations)
         self.upsampler = Conv(_HIDDEN, 9 * _CONVEX**2, 1, gain=0.1, key=keys[-1])
-        self.octaves = tuple(octaves)
+        self.octaves, self.medians = tuple(octaves), medians
         self.divisor = _FINEST * 2 ** (count - 1 - self.octaves[0])
 
     def encode(self, image: Float[Array, "height width 3"]) -> tuple[Levels, ...]:
@@ -136,7 +145,10 @@ class PyramidFlow(AbstractFlowNetwork):
                     flow, hidden = self.decoders[level](one[level], other[level], flow, hidden)
                 flows.append(flow)
             finer = convex_upsample(flow, self.upsampler(hidden), _CONVEX)
-        return (*flows, _sized_flow(finer, 1 - self.octaves[-1]))
+        last = _sized_flow(finer, 1 - self.octaves[-1])
+        for _ in range(self.medians):
+            last = median_filter(last, _MEDIAN_PX)
+        return (*flows, last)
 
     def _levels(self, octave: int) -> int:
         """How many of the levels, finest first, are used on an octave."""

@@ -22,6 +22,9 @@ BLOCK_PX = 7
 GAIN = 2.5
 """A flow that does not divide the mean squared residual of rest by this much explains noise."""
 
+GENTLE_GAIN, GENTLE_BLOCK_PX = 1.75, 25
+"""The same for a flow by itself (`+rest`), which loses less motion so; a tracer rather loses motion than takes noise."""
+
 _LEAST_VARIANCE = 0.25  # of eight-bit brightness: rounding alone has 1/6 in a difference
 
 
@@ -29,10 +32,13 @@ def settled(
     flow_px: Float[np.ndarray, "height width 2"],
     here: UInt8[np.ndarray, "height width 3"],
     there: UInt8[np.ndarray, "height width 3"],
+    *,
+    gain: float = GAIN,
+    block_px: int = BLOCK_PX,
 ) -> Float[np.ndarray, "height width 2"]:
     """The flow from `here` to `there`, zero where rest explains the pictures as well.
 
-    Rest is kept where |I(x) - J(x)|^2 <= `GAIN` |I(x) - J(x + u)|^2 + rounding, both averaged over a block of the
+    Rest is kept where |I(x) - J(x)|^2 <= `gain` |I(x) - J(x + u)|^2 + rounding, both averaged over a block of the
     brightness. Errors as of `check_pictures`.
     """
     pictures = check_pictures(here, there)
@@ -41,8 +47,8 @@ def settled(
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     flow = np.asarray(flow_px, np.float32)
     moved = cv2.remap(other, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    rest, motion = (cv2.blur(np.square(each - one), (BLOCK_PX, BLOCK_PX)) for each in (other, moved))
-    still = rest <= GAIN * motion + _LEAST_VARIANCE
+    rest, motion = (cv2.blur(np.square(each - one), (block_px, block_px)) for each in (other, moved))
+    still = rest <= gain * motion + _LEAST_VARIANCE
     return np.where(still[..., None], np.float32(0.0), flow)
 
 
