@@ -12,7 +12,7 @@ def median_filter(image: Float[Array, "height width channel"], size: int) -> Flo
     """Median of each channel over size x size pixels, the picture's edge pixels repeated beyond it.
 
     As `scipy.ndimage.median_filter(mode="nearest")`, made of minima and maxima of whole pictures: XLA makes one loop of
-    them, where a sort of every pixel's neighbours would take ten times as long. The gradient goes to the pixel that the
+    them, where a sort of every pixel's neighbours would take twenty times as long. The gradient goes to the pixel that the
     median is. Raises `ValueError` for an even or negative size.
     """
     if size < 1 or size % 2 == 0:
