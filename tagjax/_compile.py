@@ -29,7 +29,7 @@ def large_program(
             options: dict[str, bool | int] = {}
             if backend == "cpu" and jax.__version_info__ < (0, 11):  # an option that XLA does not know is an error
                 options["xla_cpu_use_fusion_emitters"] = False
-                if level is not None:
+                if level is not None and not jax.config.read("jax_disable_most_optimizations"):
                     options["xla_backend_optimization_level"] = level
             jit: Any = eqx.filter_jit  # its overloads leave out what goes on to `jax.jit`
             return jit(function, donate=donate, compiler_options=options)

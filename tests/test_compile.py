@@ -8,26 +8,24 @@ from jaxtyping import Array
 
 from tagjax._compile import large_program
 
-TRACED: list[str] = []
-
-
-def _scaled(x: Array, name: str, *, times: float) -> Array:
-    """What `name` says of x."""
-    TRACED.append(name)
-    return times * (jnp.sin(x) if name == "sine" else jnp.cos(x))
-
 
 @pytest.mark.parametrize("level", [None, 1])
 def test_a_program_is_its_function_compiled_once(level: int | None) -> None:
-    program = large_program(level=level)(_scaled)
+    traced: list[str] = []
+
+    def scaled(x: Array, name: str, *, times: float) -> Array:
+        """What `name` says of x."""
+        traced.append(name)
+        return times * (jnp.sin(x) if name == "sine" else jnp.cos(x))
+
+    program = large_program(level=level)(scaled)
     x = np.linspace(0.0, 3.0, 7, dtype=np.float32)
-    TRACED.clear()
     for name, expected in (("sine", np.sin), ("cosine", np.cos)):
         for shift in (0.0, 1.0):
             found = program(jnp.asarray(x + np.float32(shift)), name, times=2.0)
             np.testing.assert_allclose(found, 2 * expected(x + np.float32(shift)), rtol=1e-5, atol=1e-6)
-    assert TRACED == ["sine", "cosine"]
-    assert program.__doc__ == _scaled.__doc__
+    assert traced == ["sine", "cosine"]
+    assert program.__doc__ == scaled.__doc__
     with pytest.raises(ValueError, match="top-level"):
         jax.grad(lambda x: jnp.sum(program(x, "sine", times=2.0)))(jnp.asarray(x))
 

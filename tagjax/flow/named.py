@@ -68,7 +68,8 @@ AT_REST = "+rest"
 def make_flow(name: str) -> FlowFunction:
     """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
 
-    With `AT_REST` after it, the same as `SettledFlow`. Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
+    With `AT_REST` after it, the same as `SettledFlow`. Raises `ValueError` for a name that is none of these, and for weights
+    that cannot be used.
     """
     if name.endswith(AT_REST):
         return SettledFlow(make_flow(name.removesuffix(AT_REST)))
