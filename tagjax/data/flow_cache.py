@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import shutil
 import time
@@ -16,9 +15,8 @@ import zarr
 from rich.progress import track
 from zarr.storage import LocalStore
 
-from ..flow.named import flow_along, flow_key, make_flow
+from ..flow.named import flow_key, make_flow, settled_along
 from ..flow.opencv import FlowFunction
-from ..flow.stillness import settled
 from ..recording import Recording, RecordingError
 from .store import StoredFrames, create_array
 
@@ -104,10 +102,7 @@ def _pairs(recording: Recording, first: int, last: int, flow: FlowFunction):
     if first == 0:
         zero = np.zeros((*recording.colour.shape[1:3], 2), np.float32)
         yield zero, zero
-    pictures, again = itertools.tee(np.asarray(recording.colour[t]) for t in range(start, last))
-    along = zip(itertools.pairwise(again), flow_along(flow, pictures), strict=True)
-    for (before, after), (forward, backward) in along:
-        yield settled(forward, before, after), settled(backward, after, before)
+    yield from settled_along(flow, (np.asarray(recording.colour[t]) for t in range(start, last)))
 
 
 def _fill(recording: Recording, folder: Path, key: str, flow: FlowFunction) -> None:

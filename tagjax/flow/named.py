@@ -16,8 +16,8 @@ import numpy as np
 from . import opencv
 from .estimate import NetworkFlow
 from .opencv import FlowFunction
-from .pictures import as_bytes, check_pictures
-from .stillness import GENTLE_BLOCK_PX, GENTLE_GAIN, settled
+from .pictures import check_pictures
+from .stillness import BLOCK_PX, GAIN, GENTLE_BLOCK_PX, GENTLE_GAIN, settled
 from .weights import find_weights, load_network, packaged_weights, weights_about
 
 
@@ -36,20 +36,11 @@ class SettledFlow:
         self.flow = flow
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return self._settled(np.asarray(self.flow(first, second)), first, second)
+        return settled(np.asarray(self.flow(first, second)), first, second, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
 
     def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Flow forward and backward between neighbouring pictures, as `flow_along` of the other gives it."""
-        pictures, again = itertools.tee(pictures)
-        for (forward, backward), (one, other) in zip(
-            flow_along(self.flow, pictures), itertools.pairwise(again), strict=True
-        ):
-            yield self._settled(forward, one, other), self._settled(backward, other, one)
-
-    @staticmethod
-    def _settled(flow_px: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        here, there = map(as_bytes, check_pictures(first, second))
-        return settled(flow_px, here, there, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
+        return settled_along(self.flow, pictures, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
 
 
 CLASSICAL: dict[str, Callable[[], FlowFunction]] = {"zero": ZeroFlow, **opencv.FLOWS}
@@ -109,6 +100,18 @@ def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[t
         if before is not None:
             yield flow(before, picture), flow(picture, before)
         before = picture
+
+
+def settled_along(
+    flow: FlowFunction, pictures: Iterable[np.ndarray], *, gain: float = GAIN, block_px: int = BLOCK_PX
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """`flow_along`, zero where rest explains the pictures as well (`settled`)."""
+    pictures, again = itertools.tee(pictures)
+    for (forward, backward), (one, other) in zip(flow_along(flow, pictures), itertools.pairwise(again), strict=True):
+        yield (
+            settled(forward, one, other, gain=gain, block_px=block_px),
+            settled(backward, other, one, gain=gain, block_px=block_px),
+        )
 
 
 def _weights(name: str) -> Path:

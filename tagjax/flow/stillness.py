@@ -6,15 +6,17 @@ motion on every slanted floor, which is as much as a tag in a hand moves between
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float
 
 from ..image.census import to_grey
 from ..image.warp import gather, pixel_grid
-from .pictures import check_pictures
+from .pictures import as_bytes, check_pictures
 
 BLOCK_PX = 7
 """Side of the square over which residuals are averaged."""
@@ -30,8 +32,8 @@ _LEAST_VARIANCE = 0.25  # of eight-bit brightness: rounding alone has 1/6 in a d
 
 def settled(
     flow_px: Float[np.ndarray, "height width 2"],
-    here: UInt8[np.ndarray, "height width 3"],
-    there: UInt8[np.ndarray, "height width 3"],
+    here: Any,
+    there: Any,
     *,
     gain: float = GAIN,
     block_px: int = BLOCK_PX,
@@ -39,9 +41,9 @@ def settled(
     """The flow from `here` to `there`, zero where rest explains the pictures as well.
 
     Rest is kept where |I(x) - J(x)|^2 <= `gain` |I(x) - J(x + u)|^2 + rounding, both averaged over a block of the
-    brightness. Errors as of `check_pictures`.
+    brightness. Takes pictures as `check_pictures` does, whose errors it raises.
     """
-    pictures = check_pictures(here, there)
+    pictures = map(as_bytes, check_pictures(here, there))
     one, other = (cv2.cvtColor(np.asarray(each), cv2.COLOR_RGB2GRAY).astype(np.float32) for each in pictures)
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
