@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -63,16 +65,15 @@ def push_gather(
     """
     past, valid = motion.distance_m[..., 1:], motion.valid[..., 1:]
     num_past = past.shape[-1]
-    taps, weight = gather_taps(jnp.concatenate([past, valid.astype(past.dtype)], axis=-1), backward_px)
-    values, known = taps[..., :num_past], taps[..., num_past:]
-    same_surface = (
-        (jnp.abs(values[..., -1] - distance_m[None]) <= max_step_m) & (known[..., -1] > 0) & (distance_m > 0)[None]
-    )
-    weight = jnp.where(same_surface, weight, 0.0)[..., None] * known
-    total = jnp.sum(weight, axis=0)
+    taps = []
+    for tap, weight in gather_taps(jnp.concatenate([past, valid.astype(past.dtype)], axis=-1), backward_px):
+        values, known = tap[..., :num_past], tap[..., num_past:]
+        same_surface = (jnp.abs(values[..., -1] - distance_m) <= max_step_m) & (known[..., -1] > 0) & (distance_m > 0)
+        taps.append((values, jnp.where(same_surface, weight, 0.0)[..., None] * known))
+    total = functools.reduce(jnp.add, [weight for _, weight in taps])
+    mixed = functools.reduce(jnp.add, [values * weight for values, weight in taps])
     carried = total > 1e-3
-    mixed = jnp.sum(values * weight, axis=0) / jnp.where(carried, total, 1.0)
-    return _append(jnp.where(carried, mixed, 0.0), carried, distance_m)
+    return _append(jnp.where(carried, mixed / jnp.where(carried, total, 1.0), 0.0), carried, distance_m)
 
 
 def carry(

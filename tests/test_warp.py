@@ -51,6 +51,40 @@ def test_gather_outside_the_picture_is_not_covered():
     assert not covered.any()
 
 
+def test_taps_are_the_four_pixels_around_with_weights_inside_only():
+    image = _smooth((5, 6, 2))
+    flow = np.random.default_rng(0).uniform(-4, 4, (5, 6, 2)).astype(np.float32)
+    flow[0, :3] = [[-1.0, 0.0], [4.0, 0.0], [0.0, 4.0]]  # onto the border and just beyond, in whole pixels
+    taps = warp.gather_taps(jnp.asarray(image), jnp.asarray(flow))
+    mixed = sum(np.asarray(value) * np.asarray(weight)[..., None] for value, weight in taps)
+    total = sum(np.asarray(weight) for _, weight in taps)
+    for row in range(5):
+        for column in range(6):
+            x, y = column + flow[row, column, 0], row + flow[row, column, 1]
+            u, v = np.meshgrid(np.arange(6), np.arange(5))
+            weights = np.clip(1 - np.abs(u - x), 0, None) * np.clip(1 - np.abs(v - y), 0, None)
+            np.testing.assert_allclose(total[row, column], weights.sum(), atol=1e-5)
+            np.testing.assert_allclose(mixed[row, column], np.tensordot(weights, image, 2), atol=1e-5)
+
+
+def test_what_moves_nowhere_or_far_away_is_not_covered_and_harms_nothing():
+    image = jnp.ones((4, 5, 1)).at[0, 0].set(jnp.nan)
+    flow = jnp.zeros((4, 5, 2)).at[2, 2, 0].set(jnp.nan).at[3, 3].set(jnp.inf).at[3, 4].set(-1e20).at[1, 1].set(2e9)
+    out, covered = gather(image, flow)
+    gone = [(2, 2), (3, 3), (3, 4), (1, 1)]
+    assert not any(bool(covered[place]) for place in gone)
+    assert not any(float(out[place][0]) for place in gone)
+    assert int(covered.sum()) == 20 - len(gone)
+    np.testing.assert_array_equal(np.isnan(out), np.isnan(image))
+
+
+def test_at_whole_pixels_the_gradient_leads_to_the_next():
+    image = jnp.asarray(_smooth((4, 6, 1)))
+    slope = jax.grad(lambda flow: jnp.sum(gather(image, flow)[0]))(jnp.zeros((4, 6, 2)))
+    np.testing.assert_allclose(slope[:, :-1, 0], np.diff(image[..., 0], axis=1), atol=1e-6)
+    np.testing.assert_allclose(slope[:-1, :, 1], np.diff(image[..., 0], axis=0), atol=1e-6)
+
+
 def test_splat_by_whole_pixels_moves_the_image_and_marks_the_hole():
     image = jnp.asarray(_smooth((8, 9, 2)))
     flow = jnp.broadcast_to(jnp.asarray([2.0, -1.0]), (8, 9, 2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
@@ -35,15 +37,30 @@ def pixel_grid(
     return x, y
 
 
-def gather_taps(
-    image: Float[Array, "height width channel"], flow_px: Float[Array, "height width 2"]
-) -> tuple[Float[Array, "4 height width channel"], Float[Array, "4 height width"]]:
-    """The four values around `pixel + flow` with their bilinear weights (0 outside), for a caller's own mixture."""
+Taps = tuple[tuple[Float[Array, "height width channel"], Float[Array, "height width"]], ...]
+
+
+def gather_taps(image: Float[Array, "height width channel"], flow_px: Float[Array, "height width 2"]) -> Taps:
+    """The four values around `pixel + flow`, each with its bilinear weight (0 outside), for a caller's own mixture.
+
+    Four maps and not one stack: XLA then reads and mixes them in one loop, several times as fast.
+    """
     height, width, channels = image.shape
     x, y = pixel_grid(height, width, flow_px.dtype)
-    index, weight = _taps(x + flow_px[..., 0], y + flow_px[..., 1], (height, width))
-    values = jnp.take(image.reshape(-1, channels), index.reshape(-1), axis=0)
-    return values.reshape(4, height, width, channels), weight
+    x, y = x + flow_px[..., 0], y + flow_px[..., 1]
+    left, top = jnp.clip(jnp.floor(x), -1, width - 1), jnp.clip(jnp.floor(y), -1, height - 1)
+    bordered = jnp.pad(image, ((1, 1), (1, 1), (0, 0))).reshape(-1, channels)
+    corner = ((top + 1) * (width + 2) + left + 1).astype(jnp.int32)
+    near = (x >= -1) & (x <= width) & (y >= -1) & (y <= height)
+    taps = []
+    for down in (0, 1):
+        for right in (0, 1):
+            column, row = left + right, top + down
+            share = (x - left if right else 1 - (x - left)) * (y - top if down else 1 - (y - top))
+            inside = near & (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+            value = bordered.at[corner + down * (width + 2) + right].get(mode="clip")
+            taps.append((value, jnp.where(inside, share, 0.0)))
+    return tuple(taps)
 
 
 def gather(
@@ -55,14 +72,14 @@ def gather(
 
     Returns the samples and where they rest on valid pixels by at least half of their weight; 0 elsewhere.
     """
-    values, weight = gather_taps(image, flow_px)
+    taps = gather_taps(image, flow_px)
     if valid is not None:
-        known, _ = gather_taps(valid.astype(image.dtype)[..., None], flow_px)
-        weight = weight * known[..., 0]
-    total = jnp.sum(weight, axis=0)
-    mixed = jnp.sum(values * weight[..., None], axis=0) / jnp.maximum(total, _TINY)[..., None]
+        known = gather_taps(valid.astype(image.dtype)[..., None], flow_px)
+        taps = [(value, weight * mark[..., 0]) for (value, weight), (mark, _) in zip(taps, known, strict=True)]
+    total = functools.reduce(jnp.add, [weight for _, weight in taps])
+    mixed = functools.reduce(jnp.add, [value * weight[..., None] for value, weight in taps])
     covered = total >= 0.5
-    return jnp.where(covered[..., None], mixed, 0.0), covered
+    return jnp.where(covered[..., None], mixed / jnp.maximum(total, _TINY)[..., None], 0.0), covered
 
 
 def splat(
