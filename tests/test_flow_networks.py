@@ -15,12 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
 from tagjax.config import build
 from tagjax.flow import flownet, raft
-from tagjax.flow._layers import convex_upsample, enlarge, enlarge_flow, shrink, space_to_depth
+from tagjax.flow._layers import Conv, SeparableConv, convex_upsample, enlarge, enlarge_flow, shrink, space_to_depth
 from tagjax.flow.cost_volume import cost_volume, normalise_features
 from tagjax.flow.flownet import FlowNetC, FlowNetS, strided_cost_volume
 from tagjax.flow.network import AbstractFlowNetwork, flow_both_ways
@@ -36,6 +38,7 @@ PUBLISHED: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "raft_small": RAFTSmall,
     "pyramid": PyramidFlow,
     "pyramid_fine": lambda: PyramidFlow(octaves=(-1, 0, 1, 2), medians=2),
+    "pyramid_fast": lambda: build(_settings("pyramid_fast")),
 }
 TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "flownet_s": lambda: FlowNetS(width=1 / 64),
@@ -44,7 +47,13 @@ TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "raft_small_lean": lambda: RAFTSmall(updates=2, levels=2, radius=1, all_pairs=False),
     "pyramid": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,))),
     "pyramid_fine": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,)), octaves=(-1, 0, 1, 2), medians=1),
+    "pyramid_fast": lambda: PyramidFlow((6, 8), (1, 2), decoder_widths=((8,), (8,)), separable=True, matched=(4, 0)),
 }
+
+
+def _settings(name: str) -> dict[str, Any]:
+    with initialize_config_dir(str(CONF.parent), version_base="1.3"):
+        return OmegaConf.to_container(compose("train_flow", [f"flow={name}"]).flow)
 
 
 @functools.cache
@@ -107,6 +116,7 @@ def _count(network: Any) -> int:
         ("raft_small", 990_162),
         ("pyramid", 691_020),
         ("pyramid_fine", 691_020),
+        ("pyramid_fast", 220_864),
     ],
 )
 def test_parameters_are_as_many_as_published(name, count):
@@ -120,6 +130,7 @@ def test_parameters_are_as_many_as_published(name, count):
         ("flownet_c", [64, 32, 16, 8, 4, 1]),
         ("raft_small", [8] * 12 + [1]),
         ("pyramid", [32, 16, 8, 4, 1]),
+        ("pyramid_fast", [32, 16, 8, 4, 1]),
         ("pyramid_fine", [64, 32, 16, 8, 8, 4, 2, 1, 1]),
     ],
 )
@@ -314,6 +325,8 @@ def test_raft_takes_pictures_smaller_than_its_pyramid():
         lambda: PyramidFlow(octaves=(1, 2)),
         lambda: PyramidFlow(octaves=(0, -1)),
         lambda: PyramidFlow(medians=-1),
+        lambda: PyramidFlow(matched=(8,)),
+        lambda: PyramidFlow(matched=(8, 8, 8, -8)),
     ],
 )
 def test_settings_that_make_no_network_are_refused(make):
@@ -416,6 +429,45 @@ def test_space_to_depth_takes_squares():
     image = _noise(6, 4, 3)
     expected = np.array([[image[2 * y : 2 * y + 2, 2 * x : 2 * x + 2].ravel() for x in range(2)] for y in range(3)])
     np.testing.assert_array_equal(space_to_depth(jnp.asarray(image), 2), expected)
+
+
+@pytest.mark.parametrize(("size", "height", "width"), [(1, 5, 7), (2, 6, 8), (2, 7, 5), (3, 9, 10)])
+def test_convolution_of_squares_is_the_convolution(size, height, width):
+    layer = Conv(3, 4, size, stride=size, padding=0, key=jax.random.key(0))
+    x = jnp.asarray(_noise(height, width, 3))
+    expected = jax.lax.conv_general_dilated(
+        x[None], layer.weight, (size, size), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+    np.testing.assert_allclose(layer(x), expected[0], atol=1e-5)
+
+
+def test_separable_convolution_is_one_of_each_channel_and_one_of_all():
+    layer = SeparableConv(3, 5, key=jax.random.key(1))
+    layer = eqx.tree_at(lambda layer: layer.point.bias, layer, jnp.arange(5.0))
+    image = _noise(6, 8, 3)
+    each = [
+        cv2.filter2D(image[..., n], -1, np.asarray(layer.depth[..., n]), borderType=cv2.BORDER_CONSTANT)
+        for n in range(3)
+    ]
+    expected = np.stack(each, axis=-1) @ np.asarray(layer.point.weight[0, 0]) + np.arange(5)
+    np.testing.assert_allclose(layer(jnp.asarray(image)), expected, atol=1e-5)
+
+
+def test_separable_convolution_gradient(gradients_agree):
+    layer = SeparableConv(2, 3, key=jax.random.key(2))
+
+    def found(x, depth, weight, bias):
+        changed = eqx.tree_at(lambda q: (q.depth, q.point.weight, q.point.bias), layer, (depth, weight, bias))
+        return changed(x)
+
+    gradients_agree(found, (_noise(4, 5, 2), layer.depth, layer.point.weight, _noise(3)))
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4, 8])
+def test_enlarging_is_bilinear(factor):
+    image = jnp.asarray(_noise(5, 7, 2))
+    expected = jax.image.resize(image, (5 * factor, 7 * factor, 2), "linear")
+    np.testing.assert_allclose(enlarge(image, factor), expected, atol=1e-6)
 
 
 def test_enlarging_keeps_centres_and_shrinking_undoes_it():

@@ -94,10 +94,14 @@ def weights_about(source: str | Path) -> dict[str, Any]:
 
 
 def _packaged_for(network: AbstractFlowNetwork) -> Path:
+    """The packaged weights of this class and these shapes; of this class at least."""
     own = f"{type(network).__module__}.{type(network).__name__}"
-    for name in packaged_weights():
-        if weights_about(name)["flow"].get("_target_") == own:
+    of_class = [name for name in packaged_weights() if weights_about(name)["flow"].get("_target_") == own]
+    for name in of_class:
+        if _shapes(_outline(weights_about(name)["flow"], name)) == _shapes(network):
             return PACKAGED / f"{name}.npz"
+    if of_class:
+        return PACKAGED / f"{of_class[0]}.npz"
     there = ", ".join(packaged_weights()) or "none"
     raise ValueError(f"No weights are packaged for {own} (there are: {there}). Train it, or give a file of weights.")
 
