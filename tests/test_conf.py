@@ -62,6 +62,7 @@ def test_every_training_configuration_is_valid(override: str) -> None:
         ["flow=raft_small"],
         ["recipe=fine_tune"],
         ["recipe=raft"],
+        ["recipe=student"],
         ["recipe=flownet"],
         ["recipe=flownet", "flow=flownet_c"],
     ],
@@ -76,7 +77,7 @@ def test_every_flow_training_configuration_is_valid(overrides: list[str]) -> Non
 
 
 def test_every_recipe_is_tested() -> None:
-    assert set(_options("recipe")) == {"recipe=fine_tune", "recipe=flownet", "recipe=raft"}
+    assert set(_options("recipe")) == {"recipe=fine_tune", "recipe=flownet", "recipe=raft", "recipe=student"}
 
 
 def test_evaluation_configurations_are_valid() -> None:

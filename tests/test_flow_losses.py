@@ -17,6 +17,7 @@ from tagjax.flow.losses import (
     charbonnier,
     data_distance,
     data_term,
+    imitation_term,
     inconsistency,
     inside,
     level_terms,
@@ -361,6 +362,47 @@ def test_teaching_gradient_reaches_the_student_only(gradients_agree):
 
 
 # The whole
+
+
+def _imitated(levels, teacher, **changes):
+    return imitation_term(levels, teacher, dataclasses.replace(SETTINGS, **changes))
+
+
+def test_imitation_is_the_weighted_robust_distance_from_the_teachers_flow():
+    teacher = _uneven(8, 12, 3.0)
+    levels = (jnp.asarray(_uneven(2, 3, seed=1)), jnp.asarray(_uneven(8, 12, seed=2)))
+    rough = 4 * np.asarray(levels[0]) - teacher.reshape(2, 4, 3, 4, 2).mean((1, 3))
+    errors = [np.sqrt(np.sum(gap**2, -1) + 1e-4) for gap in (np.asarray(levels[1]) - teacher, rough)]
+    expected = sum(w * np.mean((e + 0.01) ** 0.7) for w, e in zip((1.0, 0.3), errors, strict=True))
+    found = _imitated(levels, jnp.asarray(teacher), robustness=0.7, level_weights=(1.0, 0.3, 9.0))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert float(_imitated((jnp.asarray(teacher),), jnp.asarray(teacher))) < float(
+        _imitated(levels[1:], jnp.asarray(teacher))
+    )
+
+
+def test_where_the_teacher_says_nothing_nothing_is_asked():
+    whole = _uneven(8, 8, 2.0)
+    teacher = whole.copy()
+    teacher[:4] = np.nan
+    levels = (jnp.asarray(_uneven(4, 4, seed=1)), jnp.asarray(_uneven(8, 8, seed=2)))
+    found, pull = jax.value_and_grad(_imitated)(levels, jnp.asarray(teacher))
+    assert np.isfinite(found)
+    assert all(np.isfinite(leaf).all() for leaf in pull)
+    assert not np.any(pull[1][:4])
+    assert not np.any(pull[0][:2])
+    assert np.all(np.any(pull[1][4:], axis=-1))
+    lower = _imitated(tuple(level[level.shape[0] // 2 :] for level in levels), jnp.asarray(whole[4:]))
+    np.testing.assert_allclose(found, lower / 2, rtol=1e-5)
+    assert float(_imitated(levels, jnp.full((8, 8, 2), jnp.nan))) == 0.0
+
+
+def test_imitation_gradient(gradients_agree):
+    teacher = _uneven(4, 4, 2.0)
+    gradients_agree(
+        lambda rough, fine: _imitated((rough, fine), jnp.asarray(teacher, rough.dtype), robustness=0.7),
+        (_uneven(2, 2, seed=1), _uneven(4, 4, seed=2)),
+    )
 
 
 def _pyramid(seed: int = 0) -> tuple[jax.Array, ...]:

@@ -29,6 +29,7 @@ from tagjax.data.picture_pairs import (
 )
 from tagjax.flow.estimate import NetworkFlow
 from tagjax.flow.losses import FlowLossSettings
+from tagjax.flow.named import make_flow
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
@@ -38,6 +39,7 @@ from tagjax.training.checkpoint import Checkpoints
 from tagjax.training.flow_run import flow_of, flow_of_peer, run_flow_training, scores
 from tagjax.training.flow_sources import DrawnSettings, drawn_pairs, flow_dataset, validation_pairs
 from tagjax.training.flow_step import FlowTrainState, batch_loss, flow_step
+from tagjax.training.flow_teacher import cut_pairs, taught_flow
 
 SMALL = {
     "_target_": "tagjax.flow.pyramid.PyramidFlow",
@@ -196,9 +198,170 @@ def test_the_clean_pictures_reach_further_by_the_margin() -> None:
     assert wide["clean"].shape == (2, 48, 64, 3)
 
 
+def _moved(flow: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """The picture that `flow`, of a plane's coordinates, takes to the given one."""
+    height, width, _ = flow.shape
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    return cv2.remap(picture, x + flow[..., 0], y + flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+
+
+def test_flow_is_cut_as_the_pictures_are() -> None:
+    """What the cut flow says of the cut pictures is what the whole one says of the whole: turned, scaled, mirrored."""
+    second = cv2.GaussianBlur(smooth_pictures(1, 120, 140)[0], (0, 0), 2)
+    x, y = np.meshgrid(np.linspace(-1, 1, 140), np.linspace(-1, 1, 120))
+    flow = np.stack([5 + 2 * y, -3 + 2 * x], axis=-1).astype(np.float32)
+    pair = np.stack([_moved(flow, second), second])
+    settings = dataclasses.replace(PLAIN, height=64, width=64, margin_px=8, scale=(0.8, 1.2), turn_deg=30.0)
+    inner = slice(12, -12), slice(12, -12)
+    for seed in range(6):
+        varied = dataclasses.replace(settings, transpose_share=float(seed % 2))
+        found = vary(pair, np.random.default_rng(seed), varied, flow)
+        assert found["flow_px"].shape == (64, 64, 2)
+        assert found["clean"].shape == (2, 80, 80, 3)
+        one, other = found["seen"].astype(np.float32)
+        known = np.isfinite(found["flow_px"]).all(axis=-1)[inner]
+        back = np.abs(_moved(np.nan_to_num(found["flow_px"]), other) - one)[inner][known]
+        still = np.abs(other - one)[inner][known]
+        assert known.mean() > 0.7
+        assert back.mean() < 0.15 * still.mean(), (seed, back.mean(), still.mean())
+
+
+def test_beyond_the_picture_there_is_no_flow() -> None:
+    flow = np.ones((64, 64, 2), np.float32)
+    settings = dataclasses.replace(PLAIN, height=64, width=64, turn_deg=45.0)
+    shares = [
+        np.isnan(vary(smooth_pictures(2, 64, 64), np.random.default_rng(seed), settings, flow)["flow_px"]).mean()
+        for seed in range(4)
+    ]
+    assert max(shares) > 0.05
+
+
+def test_negatives_and_exchanged_colours_are_those() -> None:
+    pair = smooth_pictures(2, 64, 80)
+    plain = vary(pair, np.random.default_rng(0), PLAIN)
+    negative = vary(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_share=1.0))
+    np.testing.assert_array_equal(negative["clean"], plain["clean"])
+    np.testing.assert_allclose(negative["seen"].astype(float), 255 - plain["seen"].astype(float), atol=1)
+    orders = set()
+    for seed in range(8):
+        found = vary(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_share=1.0))
+        order = [
+            int(np.argmin([np.abs(found["seen"][..., n].astype(int) - found["clean"][..., k]).sum() for k in range(3)]))
+            for n in range(3)
+        ]
+        np.testing.assert_array_equal(found["seen"], found["clean"][..., order])
+        orders.add(tuple(order))
+    assert len(orders) > 2
+
+
+# A teacher
+
+
+def test_cuts_are_pieces_of_pictures_the_gaps_apart_where_most_changes() -> None:
+    pictures = np.zeros((9, 40, 48, 3), np.uint8)
+    pictures[..., 0] = np.arange(9).reshape(9, 1, 1)
+    pictures[:, 4:12, 30:38, 1] = 20 * np.arange(9).reshape(9, 1, 1)
+    cuts = cut_pairs(pictures, 96, (16, 20), (1, 4), seed=0)
+    assert cuts.shape == (96, 2, 16, 20, 3)
+    gaps = {int(cut[1, 0, 0, 0]) - int(cut[0, 0, 0, 0]) for cut in cuts}
+    assert gaps == {1, 4}
+    changing = np.mean([np.any(cut[0, ..., 1] != cut[1, ..., 1]) for cut in cuts])
+    assert changing > 0.6  # one look of four would see it in a third of the cuts
+    np.testing.assert_array_equal(cuts, cut_pairs(pictures, 96, (16, 20), (1, 4), seed=0))
+    assert np.any(cuts != cut_pairs(pictures, 96, (16, 20), (1, 4), seed=1))
+
+
+def test_impossible_cuts_are_refused() -> None:
+    pictures = np.zeros((3, 40, 48, 3), np.uint8)
+    with pytest.raises(RecordingError, match="48 x 40 pixels; cuts for a student take 64 x 32"):
+        cut_pairs(pictures, 2, (32, 64), (1,), seed=0)
+    with pytest.raises(RecordingError, match="No two of 3 pictures are 4 frames apart"):
+        cut_pairs(pictures, 2, (32, 32), (4,), seed=0)
+
+
+def test_a_teachers_flow_is_computed_once_and_goes_by_pairs_and_teacher(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tagjax.training import flow_teacher
+
+    pairs = smooth_pictures(6, 40, 48).reshape(3, 2, 40, 48, 3)
+    flows = taught_flow(pairs, "dis_fast", tmp_path, progress=False)
+    peer = make_flow("dis_fast")
+    expected = np.stack([peer(first, second) for first, second in pairs]).astype(np.float16)
+    np.testing.assert_array_equal(flows[:], expected)
+    taught_flow(pairs[:2], "dis_fast", tmp_path, progress=False)
+    taught_flow(pairs, "zero", tmp_path, progress=False)
+    assert len(list(tmp_path.iterdir())) == 3
+
+    def never(name: str):
+        raise AssertionError(name)
+
+    monkeypatch.setattr(flow_teacher, "make_flow", never)
+    np.testing.assert_array_equal(taught_flow(pairs, "dis_fast", tmp_path, progress=False)[:], expected)
+    with pytest.raises(ValueError, match="Unknown optical flow 'nobody'"):
+        taught_flow(pairs, "nobody", tmp_path, progress=False)
+
+
+def test_a_teacher_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tagjax.training import flow_teacher
+
+    def broken(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(flow_teacher, "make_flow", lambda name: broken)
+    with pytest.raises(KeyboardInterrupt):
+        taught_flow(smooth_pictures(4, 32, 32).reshape(2, 2, 32, 32, 3), "dis", tmp_path, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_student_is_given_its_teachers_flow_of_drawn_pairs_and_of_cuts(tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    for number, picture in enumerate(smooth_pictures(5, 48, 64)):
+        cv2.imwrite(str(tmp_path / "walk" / f"{number}.png"), picture)
+    config = configured(tmp_path)
+    settings = dataclasses.replace(
+        config.data, teacher="dis_fast", sequences=(str(tmp_path / "walk"),), cuts_per_sequence=3
+    )
+    samples = iter(flow_dataset(settings, seed=0, progress=False))
+    for _ in range(6):
+        sample = next(samples)
+        assert sample["flow_px"].shape == (32, 32, 2)
+        assert sample["flow_px"].dtype == np.float32
+        assert sample["seen"].shape == (2, 32, 32, 3)
+    samples.close()
+    kept = {path.name.split("-")[0] for path in Path(settings.drawn.folder).iterdir()}
+    assert kept == {"flow"}
+    assert len(list(Path(settings.drawn.folder).glob("flow-of-*"))) == 2
+
+
+def test_a_student_learns_what_the_teacher_says() -> None:
+    samples = batch(2)
+    for sample in samples:
+        sample["flow_px"] = np.broadcast_to(np.float32([1.0, -0.5]), (32, 32, 2)).copy()
+    samples[1]["flow_px"][:3] = np.nan
+    optimizer, settings = optax.adam(3e-3), FlowLossSettings(robustness=0.7)
+    state = FlowTrainState.create(small_network(), optimizer, seed=0)
+    told = []
+    for _ in range(30):
+        state, numbers = flow_step(state, samples, optimizer, settings, 10.0)
+        told.append(numbers)
+    assert set(told[0]) == {"imitation", "loss", "gradient_norm", "skipped"}
+    assert told[0]["loss"] == told[0]["imitation"]
+    assert told[-1]["loss"] < 0.8 * told[0]["loss"]
+    assert not any(numbers["skipped"] for numbers in told)
+
+
 @pytest.mark.parametrize(
     "change",
-    [{"margin_px": -1}, {"scale": (0.0, 1.0)}, {"scale": (2.0, 1.0)}, {"gaps": ()}, {"gaps": (0,)}, {"height": 8}],
+    [
+        {"margin_px": -1},
+        {"scale": (0.0, 1.0)},
+        {"scale": (2.0, 1.0)},
+        {"gaps": ()},
+        {"gaps": (0,)},
+        {"height": 8},
+        {"negative_share": 1.5},
+    ],
 )
 def test_impossible_variation_is_refused(change: dict) -> None:
     with pytest.raises(ValueError, match=r"expected|too small"):

@@ -19,7 +19,7 @@ import cv2
 import grain
 import numpy as np
 import zarr
-from jaxtyping import UInt8
+from jaxtyping import Float, Float32, UInt8
 from rich.progress import track
 
 from .._types import LazyArray
@@ -53,6 +53,9 @@ class VariationSettings:
     unlike: float = 0.05  # gain between the two pictures
     noise: float = 0.02
     grey_share: float = 0.1  # pairs without colour
+    transpose_share: float = 0.0  # pairs whose rows become columns
+    negative_share: float = 0.0  # pairs with dark and bright exchanged
+    recolour_share: float = 0.0  # pairs whose colours change places
 
     def __post_init__(self) -> None:
         low, high = self.scale
@@ -64,6 +67,9 @@ class VariationSettings:
             raise ValueError(f"gaps are {self.gaps}; expected frame distances of at least 1.")
         if min(self.height, self.width) < 32:
             raise ValueError(f"Crops of {self.height} x {self.width} are too small; use at least 32 x 32.")
+        for name in ("grey_share", "transpose_share", "negative_share", "recolour_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected a share, 0 to 1.")
 
 
 class ImageFolder:
@@ -185,29 +191,68 @@ class StackedPairs:
         return np.asarray(self._pairs[int(index)])
 
 
+class TaughtPairs:
+    """Pairs that lie side by side, with a teacher's flow from first to second, as Grain's random access source."""
+
+    def __init__(self, pairs: LazyArray, flow_px: LazyArray):
+        if tuple(flow_px.shape) != (pairs.shape[0], *pairs.shape[2:4], 2):
+            raise ValueError(f"Flow of shape {tuple(flow_px.shape)} for pairs of shape {tuple(pairs.shape)}.")
+        self._pairs, self._flow_px = pairs, flow_px
+
+    def __len__(self) -> int:
+        return self._pairs.shape[0]
+
+    def __getitem__(self, index) -> dict[str, np.ndarray]:
+        number = int(index)
+        return {"pair": np.asarray(self._pairs[number]), "flow_px": np.asarray(self._flow_px[number], np.float32)}
+
+
 def vary(
-    pair: UInt8[np.ndarray, "2 _ _ 3"], rng: np.random.Generator, settings: VariationSettings
-) -> dict[str, UInt8[np.ndarray, "2 _ _ 3"]]:
+    pair: UInt8[np.ndarray, "2 _ _ 3"],
+    rng: np.random.Generator,
+    settings: VariationSettings,
+    flow_px: Float32[np.ndarray, "_ _ 2"] | None = None,
+) -> dict[str, np.ndarray]:
     """A random cut of a pair: `clean`, for the loss, and `seen`, for the network, with other light and noise.
 
-    `clean` reaches `margin_px` further than `seen` at each side.
+    `clean` reaches `margin_px` further than `seen` at each side. With the pair's flow, first to second, `flow_px` is what
+    that is between the pictures `seen`, NaN where the cut reaches beyond the picture; without, either may come first.
     """
-    cut, margin = _cut(pair, rng, settings), settings.margin_px
-    seen = cut[:, margin : margin + settings.height, margin : margin + settings.width].astype(np.float32) / 255
+    margin = settings.margin_px
+    size = settings.height + 2 * margin, settings.width + 2 * margin
+    matrix, scale = _placed(pair.shape[1:3], rng, settings, size)
+    order = rng.permutation(2) if flow_px is None else np.arange(2)
+    clean = np.stack([_cut(picture, matrix, size, scale) for picture in pair[order]])
+    inner = slice(margin, margin + settings.height), slice(margin, margin + settings.width)
+    found = {"clean": clean, "seen": _relit(clean[:, *inner].astype(np.float32) / 255, rng, settings)}
+    if flow_px is not None:
+        found["flow_px"] = _cut_flow(flow_px, matrix, size)[inner]
+    return found
+
+
+def _relit(
+    seen: Float32[np.ndarray, "2 height width 3"], rng: np.random.Generator, settings: VariationSettings
+) -> UInt8[np.ndarray, "2 height width 3"]:
+    """The pair with other light, colour and noise."""
     seen = seen ** np.float32(np.exp(rng.uniform(-settings.gamma, settings.gamma)))
     unlike = rng.uniform(-settings.unlike, settings.unlike, (2, 1, 1, 1))
     tint = rng.uniform(-settings.tint, settings.tint, (1, 1, 1, 3))
     seen = seen * (1 + rng.uniform(-settings.gain, settings.gain) + unlike + tint).astype(np.float32)
     if rng.uniform() < settings.grey_share:
         seen = np.repeat(np.mean(seen, axis=-1, keepdims=True), 3, axis=-1)
+    if _chance(rng, settings.negative_share):
+        seen = 1 - seen
+    if _chance(rng, settings.recolour_share):
+        seen = seen[..., rng.permutation(3)]
     noise = rng.standard_normal(seen.shape, np.float32) * np.float32(settings.noise * rng.uniform() ** 2)
-    return {"clean": cut, "seen": np.clip(np.rint(255 * (seen + noise)), 0, 255).astype(np.uint8)}
+    return np.clip(np.rint(255 * (seen + noise)), 0, 255).astype(np.uint8)
 
 
-def _cut(pair: np.ndarray, rng: np.random.Generator, settings: VariationSettings) -> np.ndarray:
-    """Turn, scale, mirror and crop both pictures alike; either may come first."""
-    _, height, width, _ = pair.shape
-    rows, columns = settings.height + 2 * settings.margin_px, settings.width + 2 * settings.margin_px
+def _placed(
+    whole: tuple[int, ...], rng: np.random.Generator, settings: VariationSettings, size: tuple[int, int]
+) -> tuple[Float[np.ndarray, "2 3"], float]:
+    """Where a cut of (rows, columns) `size` lies: from its pixels (x, y, 1) to the picture's; and its scale."""
+    (height, width), (rows, columns) = whole, size
     low, high = settings.scale
     scale = np.exp(rng.uniform(np.log(low), np.log(high)))
     scale = max(scale, rows / height, columns / width)
@@ -218,17 +263,42 @@ def _cut(pair: np.ndarray, rng: np.random.Generator, settings: VariationSettings
     mirror = rng.choice([-1.0, 1.0], 2)
     cosine, sine = np.cos(turn) / scale, np.sin(turn) / scale
     linear = np.array([[cosine, -sine], [sine, cosine]]) * mirror
+    if _chance(rng, settings.transpose_share):
+        linear = linear[:, ::-1]
     corner = centre - linear @ np.array([(columns - 1) / 2, (rows - 1) / 2])
-    matrix = np.concatenate([linear, corner[:, None]], axis=1)
+    return np.concatenate([linear, corner[:, None]], axis=1), float(scale)
+
+
+def _chance(rng: np.random.Generator, share: float) -> bool:
+    """Draws nothing where the share is 0: recipes without one go on seeing the pairs that they saw."""
+    return share > 0 and rng.uniform() < share
+
+
+_BACKWARDS = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+
+
+def _cut(picture: np.ndarray, matrix: np.ndarray, size: tuple[int, int], scale: float) -> np.ndarray:
+    """The cut of (rows, columns) `size`; what lies beyond the picture mirrors it."""
     # Shrinking skips pixels: blur first.
     sigma = 0.5 * (1 / scale - 1)
-    order = rng.permutation(2)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    cuts = []
-    for picture in pair[order]:
-        smooth = cv2.GaussianBlur(picture, (0, 0), sigma) if sigma > 0.1 else np.ascontiguousarray(picture)
-        cuts.append(cv2.warpAffine(smooth, matrix, (columns, rows), flags=flags, borderMode=cv2.BORDER_REFLECT_101))
-    return np.stack(cuts)
+    smooth = cv2.GaussianBlur(picture, (0, 0), sigma) if sigma > 0.1 else np.ascontiguousarray(picture)
+    return cv2.warpAffine(smooth, matrix, size[::-1], flags=_BACKWARDS, borderMode=cv2.BORDER_REFLECT_101)
+
+
+def _cut_flow(
+    flow_px: Float32[np.ndarray, "_ _ 2"], matrix: Float[np.ndarray, "2 3"], size: tuple[int, int]
+) -> Float32[np.ndarray, "rows columns 2"]:
+    """The same cut of a flow field, in the cut's pixels; NaN beyond the picture."""
+    nowhere = (np.nan, np.nan)
+    cut = cv2.warpAffine(
+        np.ascontiguousarray(flow_px),
+        matrix,
+        size[::-1],
+        flags=_BACKWARDS,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=nowhere,
+    )
+    return (cut @ np.linalg.inv(matrix[:, :2]).T).astype(np.float32)
 
 
 class _Vary(grain.transforms.RandomMap):
@@ -236,11 +306,13 @@ class _Vary(grain.transforms.RandomMap):
         self._settings = settings
 
     def random_map(self, element: Any, rng: np.random.Generator) -> Any:
+        if isinstance(element, dict):
+            return vary(element["pair"], rng, self._settings, element["flow_px"])
         return vary(element, rng, self._settings)
 
 
 def pair_dataset(
-    sources: Sequence[PairSource | StackedPairs],
+    sources: Sequence[PairSource | StackedPairs | TaughtPairs],
     shares: Sequence[float],
     settings: VariationSettings,
     *,

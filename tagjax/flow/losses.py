@@ -288,6 +288,28 @@ def sequence_terms(
     }
 
 
+def imitation_term(
+    levels: Levels, teacher_px: Float[Array, "height width 2"], settings: FlowLossSettings
+) -> Float[Array, ""]:
+    """How far all estimates of a student are from a teacher's flow: robust end-point errors, weighted by level.
+
+    Errors are in pixels of the picture at every level, against the teacher's mean over its pixels. Where the teacher's
+    flow is NaN nothing is asked. No gradient to the teacher.
+    """
+    height = teacher_px.shape[0]
+    known = jnp.all(jnp.isfinite(teacher_px), axis=-1, keepdims=True).astype(teacher_px.dtype)
+    target = jax.lax.stop_gradient(jnp.where(known > 0, teacher_px, 0.0))
+    total = jnp.zeros(())
+    # As many as have a weight: rougher ones than that are left to themselves.
+    for flow, weight in zip(levels[::-1], settings.level_weights, strict=False):
+        factor = height // flow.shape[0]
+        share = shrink(known, factor)
+        gap = factor * flow - shrink(known * target, factor) / jnp.maximum(share, 1e-6)
+        error = safe_sqrt(jnp.sum(gap * gap, axis=-1) + 1e-4)
+        total = total + weight * jnp.mean(share[..., 0] * charbonnier(error, settings.robustness))
+    return total
+
+
 def weighted(terms: dict[str, Float[Array, ""]], settings: FlowLossSettings) -> Float[Array, ""]:
     """The loss of the terms."""
     total = terms["data"] + settings.smooth_first * terms["smooth_first"]

@@ -96,7 +96,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
                     logger=logger,
                     checkpoints=checkpoints,
                     validate=validate,
-                    shown=("loss", "data", "hidden_share"),
+                    shown=("loss", "data", "hidden_share") if config.data.teacher is None else ("loss",),
                 )
         finally:
             logger.close()

@@ -21,10 +21,18 @@ from jaxtyping import UInt8
 from rich.progress import track
 
 from .._types import LazyArray
-from ..data.picture_pairs import PairSource, StackedPairs, VariationSettings, open_sequence, pair_dataset
+from ..data.picture_pairs import (
+    PairSource,
+    StackedPairs,
+    TaughtPairs,
+    VariationSettings,
+    open_sequence,
+    pair_dataset,
+)
 from ..data.stream import Stream
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.textures import PHOTOGRAPHS, photograph
+from .flow_teacher import cut_pairs, taught_flow
 
 _BATCH = 16
 _SHARD = 128
@@ -58,9 +66,13 @@ class FlowDataSettings:
     sequences: tuple[str, ...] = ()  # recordings, videos, folders of pictures: never labelled
     sequence_share: float = 0.5  # of the samples, all sequences together; the rest is drawn
     variation: VariationSettings = dataclasses.field(default_factory=VariationSettings)
+    teacher: str | None = None  # a flow by name, whose word is all that is learned from
+    cuts_per_sequence: int = 24  # pairs of the drawn ones' size that the teacher is asked for
     workers: int = 0  # processes that read and vary pairs
 
     def __post_init__(self) -> None:
+        if self.cuts_per_sequence < 1:
+            raise ValueError(f"cuts_per_sequence is {self.cuts_per_sequence}; expected at least 1.")
         if not 0 < self.sequence_share <= 1:
             raise ValueError(f"sequence_share is {self.sequence_share}; expected a share above 0 and at most 1.")
         if self.drawn.num_pairs < 1 and not self.sequences:
@@ -162,13 +174,27 @@ def validation_pairs(settings: DrawnSettings) -> FlowPair:
 def flow_dataset(
     settings: FlowDataSettings, *, seed: int, progress: bool = True, share: tuple[int, int] = (0, 1)
 ) -> Stream:
-    """The endless stream of varied pairs that the settings describe, or a share of it."""
+    """The endless stream of varied pairs that the settings describe, or a share of it; with the teacher's flow, if any."""
     sequences = [open_sequence(path, Path(settings.drawn.folder)) for path in settings.sequences]
     lengths = [sequence.shape[0] for sequence in sequences]
     whole = settings.sequence_share if settings.drawn.num_pairs else 1.0
-    sources: list[PairSource | StackedPairs] = [PairSource(s, settings.variation.gaps) for s in sequences]
+    sources: list[PairSource | StackedPairs | TaughtPairs] = []
+    for number, sequence in enumerate(sequences):
+        if settings.teacher is None:
+            sources.append(PairSource(sequence, settings.variation.gaps))
+            continue
+        size = settings.drawn.pairs.height, settings.drawn.pairs.width
+        cuts = cut_pairs(sequence, settings.cuts_per_sequence, size, settings.variation.gaps, seed=seed + number)
+        sources.append(_taught(cuts, settings, settings.teacher, progress))
     shares = [whole * length / sum(lengths) for length in lengths]
     if (settings.drawn.num_pairs and whole < 1) or not sources:
-        sources.append(StackedPairs(drawn_pairs(settings.drawn, progress=progress)))
+        pairs = drawn_pairs(settings.drawn, progress=progress)
+        sources.append(
+            StackedPairs(pairs) if settings.teacher is None else _taught(pairs, settings, settings.teacher, progress)
+        )
         shares.append(1 - whole if sequences else 1.0)
     return pair_dataset(sources, shares, settings.variation, seed=seed, workers=settings.workers, share=share)
+
+
+def _taught(pairs: LazyArray | np.ndarray, settings: FlowDataSettings, teacher: str, progress: bool) -> TaughtPairs:
+    return TaughtPairs(pairs, taught_flow(pairs, teacher, Path(settings.drawn.folder), progress=progress))

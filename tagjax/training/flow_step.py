@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PyTree, UInt8, UInt32
+from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from .._compile import large_program
 from ..flow.losses import (
     FlowLossSettings,
+    imitation_term,
     level_terms,
     margin_of,
     occluded,
@@ -108,20 +109,38 @@ def batch_loss(
     return weighted(found, settings), found
 
 
+def imitation_loss(
+    network: AbstractFlowNetwork,
+    seen: Float[Array, "batch 2 height width 3"],
+    teacher_px: Float[Array, "batch height width 2"],
+    settings: FlowLossSettings,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Mean over a batch of `imitation_term`, first to second picture; it is the whole loss of a student."""
+
+    def one(pair: Array, flow_px: Array) -> Array:
+        return imitation_term(network.decode(network.encode(pair[0]), network.encode(pair[1])), flow_px, settings)
+
+    value = jnp.mean(jax.vmap(one)(seen, teacher_px))
+    return value, {"imitation": value}
+
+
 @large_program(level=1, donate="all-except-first")
 def _update(
-    pictures: tuple[UInt8[Array, "batch 2 rows columns 3"], UInt8[Array, "batch 2 height width 3"]],
+    samples: dict[str, Array],
     state: FlowTrainState,
     optimizer: optax.GradientTransformation,
     settings: FlowLossSettings,
     average_over: float,
     teach: bool,
 ) -> tuple[FlowTrainState, dict[str, Array]]:
-    clean, seen = (picture.astype(jnp.float32) / 255 for picture in pictures)
+    clean, seen = (samples[name].astype(jnp.float32) / 255 for name in ("clean", "seen"))
     learnable, rest = eqx.partition(state.network, eqx.is_inexact_array)
 
     def loss(learnable: PyTree) -> tuple[Array, dict[str, Array]]:
-        return batch_loss(eqx.combine(learnable, rest), clean, seen, state.step, settings, teach=teach)
+        network = eqx.combine(learnable, rest)
+        if "flow_px" in samples:
+            return imitation_loss(network, seen, samples["flow_px"], settings)
+        return batch_loss(network, clean, seen, state.step, settings, teach=teach)
 
     (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(learnable)
     norm = optax.tree.norm(gradient)
@@ -154,15 +173,15 @@ def flow_step(
     settings: FlowLossSettings,
     average_over: float,
 ) -> tuple[FlowTrainState, dict[str, float]]:
-    """One update on a batch of `vary`'s pairs. A loss or gradient that is not finite changes nothing but the count.
+    """One update on a batch of `vary`'s pairs: towards the teacher's flow where they have it. A loss or gradient that is not finite changes nothing but the count.
 
     All devices share the batch, whose size must be a multiple of theirs; of several processes each gives its share.
     """
     if not samples:
         raise ValueError("A training step needs at least one pair.")
     check_batch(len(samples) * jax.process_count())
-    clean, seen = (spread(jnp.asarray(np.stack([sample[name] for sample in samples]))) for name in ("clean", "seen"))
+    batch = {name: spread(jnp.asarray(np.stack([sample[name] for sample in samples]))) for name in samples[0]}
     # Chosen here, not by a condition on the device: inside one, XLA's CPU backend takes ten times as long a step.
     teach = settings.self_supervision > 0 and int(state.step) > settings.self_supervision_after
-    state, numbers = _update((clean, seen), copied(state), optimizer, settings, average_over, teach)
+    state, numbers = _update(batch, copied(state), optimizer, settings, average_over, teach)
     return state, {name: float(value) for name, value in numbers.items()}
