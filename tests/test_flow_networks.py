@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
@@ -53,7 +52,7 @@ TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
 
 def _settings(name: str) -> dict[str, Any]:
     with initialize_config_dir(str(CONF.parent), version_base="1.3"):
-        return OmegaConf.to_container(compose("train_flow", [f"flow={name}"]).flow)
+        return dict(compose("train_flow", [f"flow={name}"]).flow)
 
 
 @functools.cache

@@ -219,7 +219,7 @@ def test_flow_is_cut_as_the_pictures_are() -> None:
         assert found["flow_px"].shape == (64, 64, 2)
         assert found["clean"].shape == (2, 80, 80, 3)
         one, other = found["seen"].astype(np.float32)
-        known = np.isfinite(found["flow_px"]).all(axis=-1)[inner]
+        known = np.all(np.isfinite(found["flow_px"]), axis=-1)[inner]
         back = np.abs(_moved(np.nan_to_num(found["flow_px"]), other) - one)[inner][known]
         still = np.abs(other - one)[inner][known]
         assert known.mean() > 0.7

@@ -43,6 +43,7 @@ from tagjax.baselines.goller import (
     make_location,
     mixture_likelihood,
     observe,
+    operating_point,
     roc_curve,
     rssi_score,
     save_calibration,
@@ -486,6 +487,19 @@ def test_the_curve_counts_and_the_threshold_is_the_best_of_all():
 def test_a_threshold_lies_between_what_it_tells_apart():
     assert best_threshold(roc_curve(np.array([-70.0, -60.0]), np.array([False, True]))) == -65.0
     assert best_threshold(roc_curve(np.array([-np.inf, -60.0]), np.array([False, True]))) == -60.0
+
+
+def test_operating_point_is_the_lowest_threshold_with_that_few_false_alarms():
+    score = np.array([5.0, 4.0, 3.0, 2.0, 1.0, -np.inf, -np.inf])
+    moved = np.array([True, False, True, False, True, False, True])
+    roc = roc_curve(score, moved)
+    assert operating_point(roc, 0.0) == (0.25, 0.0)
+    np.testing.assert_allclose(operating_point(roc, 1 / 3), (0.5, 1 / 3))
+    np.testing.assert_allclose(operating_point(roc, 0.6), (0.5, 1 / 3))
+    # Tags that were never heard are not alarmed, however many false alarms are allowed.
+    np.testing.assert_allclose(operating_point(roc, 1.0), (0.75, 2 / 3))
+    unheard = roc_curve(np.array([-np.inf, -np.inf]), np.array([True, False]))
+    assert operating_point(unheard, 1.0) == (0.0, 0.0)
 
 
 def test_intervals_are_scipys():
@@ -1192,6 +1206,8 @@ def test_a_run_writes_tables_metrics_and_plots(tmp_path):
         assert (out / file).stat().st_size > 0
     tables = (out / "tables.md").read_text()
     assert "| RFID + CV | 1 |" in tables
+    assert "| RFID + CV, at the paper's P_FA | 1 | 1.000" in tables
+    assert set(metrics["table_1_at_papers_false_alarms"]) == {"rfid", "fused"}
     assert "| true blobs | 1.000 / 0.000 | 1.000 / 0.000 |" in tables
     assert metrics["ladder"]["both"]["all"]["detected"] == 1.0
     assert metrics["handover"] == {"num_recordings": 1, "num_followed": 0}

@@ -56,8 +56,8 @@ def test_taps_are_the_four_pixels_around_with_weights_inside_only():
     flow = np.random.default_rng(0).uniform(-4, 4, (5, 6, 2)).astype(np.float32)
     flow[0, :3] = [[-1.0, 0.0], [4.0, 0.0], [0.0, 4.0]]  # onto the border and just beyond, in whole pixels
     taps = warp.gather_taps(jnp.asarray(image), jnp.asarray(flow))
-    mixed = sum(np.asarray(value) * np.asarray(weight)[..., None] for value, weight in taps)
-    total = sum(np.asarray(weight) for _, weight in taps)
+    mixed = np.sum([value * weight[..., None] for value, weight in taps], axis=0)
+    total = np.sum([weight for _, weight in taps], axis=0)
     for row in range(5):
         for column in range(6):
             x, y = column + flow[row, column, 0], row + flow[row, column, 1]

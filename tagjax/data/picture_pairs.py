@@ -327,7 +327,7 @@ def pair_dataset(
     if len(sources) != len(shares) or not sources or min(shares) <= 0:
         raise ValueError(f"{len(sources)} sources with shares {list(shares)}; expected a positive share for each.")
     datasets = [
-        grain.MapDataset.source(source).seed(seed + number).shuffle().repeat().random_map(_Vary(settings))
+        grain.MapDataset.source(cast(Any, source)).seed(seed + number).shuffle().repeat().random_map(_Vary(settings))
         for number, source in enumerate(sources)
     ]
     mixed = grain.MapDataset.mix(datasets, weights=list(shares)) if len(datasets) > 1 else datasets[0]

@@ -1,4 +1,4 @@
-"""Speed and memory of the default flow network beside OpenCV's DIS, and of a step of its training."""
+"""Speed and memory of the flow networks beside OpenCV's DIS, and of a step of the default one's training."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def _step(seed: int) -> Callable[[], Any]:
 
 
 def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timing]:
-    """One way and both ways beside DIS, the fine pyramid, along a video, and a step of training.
+    """One way and both ways beside DIS, the fast and the fine pyramid, along a video, and a step of training.
 
-    The fine pyramid comes as packaged; the weights of the others are untrained.
+    The fast and the fine pyramid come as packaged; the weights of the others are untrained.
 
     All times are of whole calls, from pictures of bytes to flow on the host.
     """
@@ -67,23 +67,25 @@ def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timin
     first, second = pictures[:2]
     network = NetworkFlow(PyramidFlow(seed=seed))
     compile_s = first_call_s(lambda: network(first, second))
-    fine = make_flow("pyramid_fine")
-    fine_compile_s = first_call_s(lambda: fine(first, second))
-    calls: dict[str, Callable[[], Any]] = {
-        "pyramid": lambda: network(first, second),
-        "fine": lambda: fine(first, second),
-    }
+    packaged = {name: make_flow(name) for name in ("pyramid_fast", "pyramid_fine")}
+    packaged_compile_s = {name: first_call_s(lambda flow=flow: flow(first, second)) for name, flow in packaged.items()}
+    calls: dict[str, Callable[[], Any]] = {"pyramid": lambda: network(first, second)}
+    calls |= {name: lambda flow=flow: flow(first, second) for name, flow in packaged.items()}
     peers = {name: make_flow(name) for name in _DIS}
     calls |= {name: lambda flow=flow: flow(first, second) for name, flow in peers.items()}
     calls["pyramid along"] = lambda: list(flow_along(network, pictures))
     calls["dis along"] = lambda: list(flow_along(peers["dis"], pictures))
     taken = medians_ms(calls, repeats)
     size, pairs = f"{width}x{height}", len(pictures) - 1
+    fast, dis = f"pyramid_fast, {size}, one way", ("DIS medium", taken["dis"])
     timings = [
-        Timing(f"pyramid, {size}, one way", taken["pyramid"], shown, taken[name], compile_s, memory["forward"])
+        Timing(fast, taken["pyramid_fast"], shown, taken[name], packaged_compile_s["pyramid_fast"])
         for name, shown in _DIS.items()
     ]
-    timings.append(Timing(f"pyramid_fine, {size}, one way", taken["fine"], "DIS medium", taken["dis"], fine_compile_s))
+    timings += [
+        Timing(f"pyramid, {size}, one way", taken["pyramid"], *dis, compile_s, memory["forward"]),
+        Timing(f"pyramid_fine, {size}, one way", taken["pyramid_fine"], *dis, packaged_compile_s["pyramid_fine"]),
+    ]
     both = taken["pyramid along"] / pairs, "DIS medium, both ways", taken["dis along"] / pairs
     timings.append(Timing(f"pyramid, {size}, both ways, a frame of a video", *both))
     step = _step(seed)

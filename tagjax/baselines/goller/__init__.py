@@ -3,6 +3,7 @@
 from ._alarm import Roc as Roc
 from ._alarm import best_threshold as best_threshold
 from ._alarm import exit_score as exit_score
+from ._alarm import operating_point as operating_point
 from ._alarm import roc_curve as roc_curve
 from ._alarm import rssi_score as rssi_score
 from ._antennas import AntennaModel as AntennaModel

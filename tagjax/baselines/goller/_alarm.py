@@ -64,3 +64,13 @@ def best_threshold(roc: Roc) -> float:
     below = roc.threshold[at + 1] if at + 1 < len(roc.threshold) else -np.inf
     here = roc.threshold[at]
     return float(0.5 * (here + below)) if np.isfinite(here) and np.isfinite(below) else float(here)
+
+
+def operating_point(roc: Roc, false_alarm: float) -> tuple[float, float]:
+    """Detection and false alarms of the lowest threshold whose false alarms are at most `false_alarm`.
+
+    To compare with others who chose their threshold elsewhere. Never a threshold of -inf (`best_threshold`).
+    """
+    allowed = (roc.false_alarm <= false_alarm + 1e-9) & ~np.isneginf(roc.threshold)
+    at = int(np.flatnonzero(allowed)[-1])
+    return float(roc.detection[at]), float(roc.false_alarm[at])

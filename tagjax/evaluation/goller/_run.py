@@ -35,6 +35,7 @@ from ._ladder import ladder
 from ._tables import (
     SIMPLE,
     TagOutcome,
+    at_papers_false_alarms,
     ladder_markdown,
     location_error_m,
     markdown,
@@ -126,12 +127,16 @@ def run_goller(
     decided_ms = 1e3 * (time.perf_counter() - start) / max(sum(len(s.time_s) for _, s, _ in splits["test"]), 1)
     first, second = table_1(found, fused, rfid), table_2(found, fused)
     rungs = ladder(calibration, splits["train"] + splits["validation"], splits["test"], settings)
-    (folder / "tables.md").write_text(markdown(first, second) + "\n" + ladder_markdown(rungs))
+    at_papers = at_papers_false_alarms(found)
+    (folder / "tables.md").write_text(markdown(first, second, at_papers) + "\n" + ladder_markdown(rungs))
     _curves(folder, found, first)
     passed = _handovers(folder, config, calibration, open_recording)
     errors = location_error_m(calibration, [(seen, truth) for _, seen, truth in splits["test"]], settings)
     metrics = {
         "table_1": {name: plain(row) for name, row in first.items()},
+        "table_1_at_papers_false_alarms": {
+            name: {"detected": point[0], "false_alarm": point[1]} for name, point in at_papers.items()
+        },
         "table_2": {name: plain(row) for name, row in second.items()},
         "ladder": {rung: {name: plain(row) for name, row in rows.items()} for rung, rows in rungs.items()},
         "handover": passed,

@@ -17,6 +17,7 @@ from ...baselines.goller import (
     Roc,
     best_threshold,
     decide,
+    operating_point,
     peak,
     roc_curve,
 )
@@ -138,6 +139,19 @@ def table_1(found: Sequence[TagOutcome], fused: float, rfid: float) -> dict[str,
     return {"rfid": rates(simple, "rfid", rfid), "fused": rates(simple, "fused", fused)}
 
 
+def at_papers_false_alarms(found: Sequence[TagOutcome]) -> dict[str, tuple[float, float]]:
+    """P_D and P_FA of both rules on the simple scenario where they alarm as many still tags as the paper's, at most.
+
+    Empty where that scenario has no leaving or no still tag.
+    """
+    simple = [one for one in found if one.variant == SIMPLE]
+    if not {"leaves", "still"} <= {one.kind for one in simple}:
+        return {}
+    return {
+        rule: operating_point(rule_roc(simple, rule, stays=False), PAPER_TABLE_1[rule][1]) for rule in ("rfid", "fused")
+    }
+
+
 def table_2(found: Sequence[TagOutcome], fused: float) -> dict[str, Rates]:
     """The fused rule on each of the paper's scenarios that was recorded."""
     here = {one.variant for one in found}
@@ -148,8 +162,10 @@ def table_2(found: Sequence[TagOutcome], fused: float) -> dict[str, Rates]:
     }
 
 
-def markdown(first: dict[str, Rates], second: dict[str, Rates]) -> str:
-    """Both tables, the paper's figures in columns of their own."""
+def markdown(
+    first: dict[str, Rates], second: dict[str, Rates], at_papers: Mapping[str, tuple[float, float]] | None = None
+) -> str:
+    """Both tables, the paper's figures in columns of their own; with `at_papers_false_alarms` in lines of their own."""
     names = {"rfid": "RFID only", "fused": "RFID + CV"}
     lines = [
         "| approach | runs | P_D (95 %) | P_D, paper | P_FA (95 %) | P_FA, paper |",
@@ -159,6 +175,11 @@ def markdown(first: dict[str, Rates], second: dict[str, Rates]) -> str:
         theirs = PAPER_TABLE_1[rule]
         cells = (_cell(row.detected, row.num_leaves), theirs[0], _cell(row.false_alarm, row.num_still), theirs[1])
         lines.append(f"| {names[rule]} | {row.num_runs} | " + " | ".join(str(cell) for cell in cells) + " |")
+    for rule, (detected, false_alarm) in (at_papers or {}).items():
+        row, theirs = first[rule], PAPER_TABLE_1[rule]
+        cells = (_cell(detected, row.num_leaves), theirs[0], _cell(false_alarm, row.num_still), theirs[1])
+        what = f"{names[rule]}, at the paper's P_FA"
+        lines.append(f"| {what} | {row.num_runs} | " + " | ".join(str(cell) for cell in cells) + " |")
     lines += [
         "",
         "| scenario | runs | P_D,run (95 %) | paper | P_D (95 %) | paper | P_FA (95 %) | paper | alarms of carried tags that stay |",
