@@ -491,6 +491,18 @@ def test_packaged_weights_are_found_by_name_and_by_network(packaged):
         flow_key("pyramids")
 
 
+def test_of_packaged_weights_of_one_class_those_that_fit_are_taken(packaged):
+    apart = {**SETTINGS, "separable": True, "matched": [4, 4]}
+    split = build({**apart, "seed": 3})
+    save_weights(packaged / "a.npz", split, {"flow": apart})
+    save_weights(packaged / "b.npz", small_network(5), {"flow": SETTINGS})
+    _same(load_weights(small_network()), small_network(5))
+    _same(load_weights(build(apart)), split)
+    _same(load_network("a"), split)
+    with pytest.raises(ValueError, match="weights of a flow network that do not fit this one"):
+        load_weights(build({**SETTINGS, "widths": [8, 16]}))
+
+
 # Named flows
 
 
