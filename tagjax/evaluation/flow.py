@@ -16,7 +16,7 @@ from rich.box import SIMPLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from ..flow.named import AT_REST, flow_key, make_flow
+from ..flow.named import flow_key, make_flow, taken_apart
 from ..flow.opencv import FlowFunction
 from ..sim.flow_pairs import FlowPairSettings
 from ..viz.flow import flow_panel
@@ -122,11 +122,10 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
 
 def _labels(names: Sequence[str]) -> dict[str, str]:
     """Short names of flows: weights by the name of their file, or by the whole path where two share it."""
-    stems = [Path(name.removesuffix(AT_REST)) for name in names]
-    short = [
-        stem.stem + (AT_REST if name.endswith(AT_REST) else "") if stem.suffix == ".npz" else name
-        for name, stem in zip(names, stems, strict=True)
-    ]
+    short = []
+    for name in names:
+        flow, rest = taken_apart(name)
+        short.append(Path(flow).stem + rest if Path(flow).suffix == ".npz" else name)
     return {stem if short.count(stem) == 1 else name: name for stem, name in zip(short, names, strict=True)}
 
 

@@ -56,14 +56,20 @@ AT_REST = "+rest"
 """What the name of a flow ends with that is to be `SettledFlow`'s."""
 
 
+def taken_apart(name: str) -> tuple[str, str]:
+    """A flow's name without `AT_REST`, and that, or nothing."""
+    return (name.removesuffix(AT_REST), AT_REST) if name.endswith(AT_REST) else (name, "")
+
+
 def make_flow(name: str) -> FlowFunction:
     """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
 
     With `AT_REST` after it, the same as `SettledFlow`. Raises `ValueError` for a name that is none of these, and for weights
     that cannot be used.
     """
-    if name.endswith(AT_REST):
-        return SettledFlow(make_flow(name.removesuffix(AT_REST)))
+    name, rest = taken_apart(name)
+    if rest:
+        return SettledFlow(make_flow(name))
     if name in CLASSICAL:
         return CLASSICAL[name]()
     path = _weights(name)
@@ -75,8 +81,9 @@ def flow_key(name: str) -> str:
 
     Other weights have another key, wherever they lie, and so have other settings. Errors as of `make_flow`.
     """
-    if name.endswith(AT_REST):
-        return f"{flow_key(name.removesuffix(AT_REST))}{AT_REST}-{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"
+    name, rest = taken_apart(name)
+    if rest:
+        return f"{flow_key(name)}{rest}-{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"
     if name in CLASSICAL:
         return name
     path = _weights(name)
