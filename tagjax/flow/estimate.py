@@ -91,6 +91,11 @@ def _encode(network: AbstractFlowNetwork, picture: Array) -> Any:
 
 
 @eqx.filter_jit
+def _forward(network: AbstractFlowNetwork, first: Array, second: Array) -> Array:
+    return network.decode(network.encode(_unit(first)), network.encode(_unit(second)))[-1]
+
+
+@eqx.filter_jit
 def _decode(network: AbstractFlowNetwork, first: Any, second: Any) -> Array:
     return network.decode(first, second)[-1]
 
@@ -153,12 +158,18 @@ def estimate(network: AbstractFlowNetwork, first: Any, second: Any) -> FlowEstim
     return jax.tree.map(lambda leaf: leaf[place], grown)
 
 
-def one_way(network: AbstractFlowNetwork, first: Any, second: Any) -> Float[Array, "height width 2"]:
-    """Flow from the first picture to the second, pixels; pictures and errors as of `estimate`."""
+def _padded_flow(network: AbstractFlowNetwork, first: Any, second: Any) -> tuple[Array, tuple[slice, slice]]:
+    """Flow from the first picture to the second, both padded, and where the pictures lie in it."""
     one, other = _checked(first, second)
     one, place, _ = _padded(network, one)
     other, _, _ = _padded(network, other)
-    return _decode(network, *_twice(_encode, network, (one,), (other,)))[place]
+    return _forward(network, one, other), place
+
+
+def one_way(network: AbstractFlowNetwork, first: Any, second: Any) -> Float[Array, "height width 2"]:
+    """Flow from the first picture to the second, pixels; pictures and errors as of `estimate`."""
+    flow_px, place = _padded_flow(network, first, second)
+    return flow_px[place]
 
 
 class NetworkFlow:
@@ -168,7 +179,8 @@ class NetworkFlow:
         self.network = network
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return np.asarray(one_way(self.network, first, second))
+        flow_px, place = _padded_flow(self.network, first, second)
+        return np.asarray(flow_px)[place]
 
     def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Flow forward and backward between neighbouring pictures; each picture is encoded once."""
