@@ -143,7 +143,11 @@ def test_estimates_go_from_rough_to_the_pictures_size(name, strides):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name.startswith("raft") else name for name in TINY]
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name.startswith("raft") or name == "pyramid_fast" else name
+        for name in TINY
+    ],
 )
 def test_from_scratch_the_flow_is_nearly_zero(name):
     first, second = _pictures(_side(name), _side(name))

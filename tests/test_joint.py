@@ -46,11 +46,11 @@ def _panned(num_frames: int = 12) -> Recording:
 def _panning_network(seed: int = 1) -> PyramidFlow:
     """A network of random weights that says about `PAN_PX` to the right, which is the way back in `_panned`."""
     network = small_network(seed)
-    bias = [decoder.head.bias for decoder in network.decoders]
+    biases = lambda n: [decoder.head.bias for decoder in n.decoders]  # noqa: E731
     # In pixels of the levels, 1/4 and 1/8 of the picture's; the rougher one's flow is enlarged and then added to.
     told = [jnp.asarray([0.1 * PAN_PX, 0.02]), jnp.asarray([0.075 * PAN_PX, -0.01])]
-    assert [b.shape for b in bias] == [(2,), (2,)]
-    return eqx.tree_at(lambda n: [decoder.head.bias for decoder in n.decoders], network, told)
+    assert [bias.shape for bias in biases(network)] == [(2,), (2,)]
+    return eqx.tree_at(biases, network, told)
 
 
 @pytest.fixture(scope="module")
