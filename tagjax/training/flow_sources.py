@@ -5,12 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
-import shutil
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 import cv2
 import jax
@@ -29,6 +25,7 @@ from ..data.picture_pairs import (
     open_sequence,
     pair_dataset,
 )
+from ..data.store import made_once
 from ..data.stream import Stream
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.textures import PHOTOGRAPHS, photograph
@@ -112,21 +109,8 @@ def drawn_pairs(settings: DrawnSettings, *, progress: bool = True) -> LazyArray:
     about = {**dataclasses.asdict(settings), "photographs": installed_photographs() if settings.photographs else []}
     del about["folder"], about["num_validation"]
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
-    folder = Path(settings.folder)
-    target = folder / f"flow-pairs-{settings.num_pairs}-{digest}.zarr"
-    if not target.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
-        try:
-            _draw(settings, partial, about, progress)
-            os.replace(partial, target)
-        except OSError:
-            # Another process may have been faster: its pairs are the same.
-            if not target.exists():
-                raise
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    return cast(LazyArray, zarr.open_array(str(target), mode="r"))
+    target = Path(settings.folder) / f"flow-pairs-{settings.num_pairs}-{digest}.zarr"
+    return made_once(target, lambda path: _draw(settings, path, about, progress))
 
 
 def _draw(settings: DrawnSettings, path: Path, about: dict, progress: bool) -> None:

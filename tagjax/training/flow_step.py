@@ -173,7 +173,9 @@ def flow_step(
     settings: FlowLossSettings,
     average_over: float,
 ) -> tuple[FlowTrainState, dict[str, float]]:
-    """One update on a batch of `vary`'s pairs: towards the teacher's flow where they have it. A loss or gradient that is not finite changes nothing but the count.
+    """One update on a batch of `vary`'s pairs: towards the teacher's flow where they have it.
+
+    A loss or gradient that is not finite changes nothing but the count.
 
     All devices share the batch, whose size must be a multiple of theirs; of several processes each gives its share.
     """

@@ -6,12 +6,8 @@ The teacher is any flow by name, slow and exact for example; the student, a netw
 from __future__ import annotations
 
 import hashlib
-import os
-import shutil
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import zarr
@@ -19,6 +15,7 @@ from jaxtyping import UInt8
 from rich.progress import track
 
 from .._types import LazyArray
+from ..data.store import made_once
 from ..flow.named import flow_key, make_flow
 from ..recording import RecordingError
 
@@ -66,34 +63,26 @@ def taught_flow(
     Made once and kept in `folder`, under the digest of the pairs and the teacher's key. Errors as of `make_flow`.
     """
     target = folder / f"flow-of-{_digest(pairs)}-{flow_key(teacher)}.zarr"
-    if not target.exists():
-        flow = make_flow(teacher)
-        folder.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
-        count, _, height, width, _ = pairs.shape
-        one = (height, width, 2)
-        try:
-            kept = zarr.create_array(
-                str(partial),
-                shape=(count, *one),
-                dtype="float16",
-                chunks=(1, *one),
-                shards=(_SHARD, *one),
-                attributes={"teacher": teacher},
-            )
-            starts = range(0, count, _SHARD)
-            for start in track(starts, description=f"flow by {teacher}", disable=not progress, transient=True):
-                block = np.asarray(pairs[start : start + _SHARD])
-                flows = [np.asarray(flow(first, second)) for first, second in block]
-                kept[start : start + len(block)] = np.stack(flows).astype(np.float16)
-            os.replace(partial, target)
-        except OSError:
-            # Another process may have been faster: its flow is the same.
-            if not target.exists():
-                raise
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    return cast(LazyArray, zarr.open_array(str(target), mode="r"))
+    return made_once(target, lambda path: _teach(pairs, teacher, path, progress))
+
+
+def _teach(pairs: LazyArray | np.ndarray, teacher: str, path: Path, progress: bool) -> None:
+    flow = make_flow(teacher)
+    count, _, height, width, _ = pairs.shape
+    one = (height, width, 2)
+    kept = zarr.create_array(
+        str(path),
+        shape=(count, *one),
+        dtype="float16",
+        chunks=(1, *one),
+        shards=(_SHARD, *one),
+        attributes={"teacher": teacher},
+    )
+    starts = range(0, count, _SHARD)
+    for start in track(starts, description=f"flow by {teacher}", disable=not progress, transient=True):
+        block = np.asarray(pairs[start : start + _SHARD])
+        flows = [np.asarray(flow(first, second)) for first, second in block]
+        kept[start : start + len(block)] = np.stack(flows).astype(np.float16)
 
 
 def _digest(pairs: LazyArray | np.ndarray) -> str:
