@@ -90,6 +90,18 @@ def update_belief(anchor: Anchor, vote: Float[Array, " bins"], weight: Float[Arr
     return Anchor(anchor.travelled_m, jax.nn.log_softmax(anchor.belief + weight * vote))
 
 
+def joined(anchor: Anchor, other: Anchor) -> Anchor:
+    """What two anchors believe together of the range now, each by frames of its own: Bayes' rule, on the first one's bins.
+
+    Ranges that the other one has no bin for are as likely to it as what it has ruled out.
+    """
+    start = _start_m(anchor)
+    least = LEAK / start.shape[0]
+    range_m = start + anchor.travelled_m[-1] - other.travelled_m[-1]
+    told = jnp.interp(range_m, start, jnp.exp(other.belief), left=least, right=least)
+    return Anchor(anchor.travelled_m, jax.nn.log_softmax(anchor.belief + jnp.log(jnp.maximum(told, least))))
+
+
 def log_density(
     anchor: Anchor, range_m: Float[Array, "height width"], depth_m: Float[Array, ""], limit: Float[Array, ""]
 ) -> Float[Array, "height width"]:

@@ -18,10 +18,10 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._numerics import safe_sqrt
-from .anchor import Anchor, log_density, lost_drift_m, move_anchor, update_belief, votes
+from .anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
 from .attention import att_corr, att_rbf, attention, coherent_score, read_support
 from .background import Background, empty_background, is_background, remember, shows_rest
 from .motion import MotionMap, carry, empty_motion, push_gather
@@ -31,7 +31,7 @@ from .phases import PhaseNoise
 from .propagation import log_likelihood_ratio, propagate, radio_speed, rival_log_odds, soft_clip, velocity_gate
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
-from .tracer import AbstractTracer, Camera, Frame, Trace, describe
+from .tracer import AbstractSmoother, Camera, Frame, Later, Trace, describe
 from .view import Grouping, Ranging, View, elapsed_s, of_each_antenna, view_of
 
 SIGNIFICANCE = 1e-3
@@ -57,6 +57,15 @@ class Belief(eqx.Module):
     log_odds: Float[Array, "*tag height width"]  # what is carried on to the next frame
     held: Float[Array, "*tag height width"]  # spread over segments that are alike
     near: Float[Array, "*tag height width"]  # log density of its range by the anchor
+
+
+class _Observation(eqx.Module):
+    """One frame as a step sees it."""
+
+    view: View
+    belief: Belief
+    step_m: Float[Array, "antenna height width"]
+    recent: Bool[Array, "height width"]
 
 
 class TagAttentionState(eqx.Module):
@@ -106,7 +115,7 @@ def paper_limit() -> dict[str, Any]:
     }
 
 
-class TagAttention(AbstractTracer):
+class TagAttention(AbstractSmoother):
     """Learnable TagAttention.
 
     Leaves whose names start with `log_` or `logit_` are stored unconstrained; `physical` gives the values.
@@ -333,6 +342,27 @@ class TagAttention(AbstractTracer):
         )
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
+        state, seen = self._observe(camera, state, frame)
+        view, belief, moved = seen.view, seen.belief, state.phases.moved
+        if frame.later is not None:
+            belief = jax.vmap(self._with_hindsight, in_axes=(None, 0, 0, 0))(view, belief, state.anchor, frame.later)
+            moved = jnp.maximum(moved, frame.later.moved)
+        rivals = soft_clip(rival_log_odds(belief.held + belief.near), jnp.exp(self.log_rivalry))
+        mask, place = jax.vmap(self._locate, in_axes=(None, 0, 0, 0, 0))(
+            view, belief, rivals, jnp.max(moved, axis=1), state.place
+        )
+        out = describe(mask, place.centre_m, seen.step_m, seen.recent, place.confidence, self.box_tail)
+        # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
+        return eqx.tree_at(lambda one: one.place, state, jax.lax.stop_gradient(place)), out
+
+    def look_back(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Later]:
+        state, seen = self._observe(camera, state, frame)
+        return state, Later(seen.belief.log_odds, state.anchor, state.phases.moved)
+
+    def _observe(
+        self, camera: Camera, state: TagAttentionState, frame: Frame
+    ) -> tuple[TagAttentionState, _Observation]:
+        """What is believed by this frame and those before it; the next state, but for the objects' places."""
         points = camera.rays * frame.depth_m[..., None]
         valid = frame.depth_m > 0
         distances = jnp.where(valid[None], camera.ranges_m(points), 0.0)
@@ -368,16 +398,9 @@ class TagAttention(AbstractTracer):
         belief, anchor, phases = jax.vmap(self._believe, in_axes=(None, 0, 0, 0, 0, 0))(
             view, carried, frame.radio, frame.reads, state.anchor, phases
         )
-        log_odds = belief.log_odds
-        rivals = soft_clip(rival_log_odds(belief.held + belief.near), jnp.exp(self.log_rivalry))
-        moved = jnp.max(phases.moved, axis=1)
-        mask, place = jax.vmap(self._locate, in_axes=(None, 0, 0, 0, 0))(view, belief, rivals, moved, state.place)
-        background = remember(state.background, distance, valid, log_odds)
-        out = describe(mask, place.centre_m, step_m, recent, place.confidence, self.box_tail)
-        # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
-        return TagAttentionState(
-            motion, time_s, log_odds, jax.lax.stop_gradient(place), anchor, background, phases
-        ), out
+        background = remember(state.background, distance, valid, belief.log_odds)
+        state = TagAttentionState(motion, time_s, belief.log_odds, state.place, anchor, background, phases)
+        return state, _Observation(view, belief, step_m, recent)
 
     def finish(self, state: TagAttentionState) -> TagAttentionState:
         return state
@@ -392,7 +415,6 @@ class TagAttention(AbstractTracer):
         phases: PhaseMemory,
     ) -> tuple[Belief, Anchor, PhaseMemory]:
         """What one tag's radio says of every pixel by now; radio, reads, anchor, phases per antenna."""
-        valid = view.valid
         evidence, gate = self._weighed_evidence(view, radio, reads)
         anchor, nears = of_each_antenna(
             functools.partial(self._update_anchor, view, evidence), view.ranging, anchor, radio
@@ -404,16 +426,31 @@ class TagAttention(AbstractTracer):
         log_odds = log_odds + jnp.sum(told, axis=0)
         log_odds = soft_clip(log_odds, jnp.exp(self.log_evidence_limit))
 
+        return Belief(*self._spread(view, log_odds), near), anchor, phases
+
+    def _spread(
+        self, view: View, log_odds: Float[Array, "height width"]
+    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
+        """Log odds shared within segments, and besides among segments that are alike."""
         share = jax.nn.sigmoid(self.logit_pool_log_odds)
-        pooled, _ = pool(view.segments, log_odds[..., None], valid.astype(log_odds.dtype))
+        pooled, _ = pool(view.segments, log_odds[..., None], view.valid.astype(log_odds.dtype))
 
         def refine(grid: Float[Array, "rows columns"]) -> Float[Array, "height width"]:
             mixed = (1.0 - share) * log_odds + share * unpool(view.segments, grid[..., None])[..., 0]
-            return jnp.where(valid, mixed, log_odds)
+            return jnp.where(view.valid, mixed, log_odds)
 
-        refined = refine(pooled[..., 0])
         spread = diffuse(pooled[..., 0], view.affinity, jax.nn.sigmoid(self.logit_diffusion))
-        return Belief(refined, refine(spread), near), anchor, phases
+        return refine(pooled[..., 0]), refine(spread)
+
+    def _with_hindsight(self, view: View, belief: Belief, anchor: Anchor, later: Later) -> Belief:
+        """What one tag's radio says by all frames, those to come included: two-filter smoothing (Fraser and Potter, 1969).
+
+        Up to this frame and from it on motion and reads are different ones, so their log odds add up; anchors per antenna.
+        """
+        log_odds = soft_clip(belief.log_odds + later.log_odds, jnp.exp(self.log_evidence_limit))
+        both = jax.vmap(joined)(anchor, later.anchor)
+        _, nears = of_each_antenna(lambda ranging, one: (one, self._near(view, ranging, one)), view.ranging, both)
+        return Belief(*self._spread(view, log_odds), jnp.sum(nears, axis=0))
 
     def _locate(
         self,
@@ -544,8 +581,12 @@ class TagAttention(AbstractTracer):
             self.anchor_unseen,
         )
         anchor = update_belief(anchor, vote, jnp.exp(self.log_anchor_weight) * self._gate(radio, view.time_s))
+        return anchor, self._near(view, ranging, anchor)
+
+    def _near(self, view: View, ranging: Ranging, anchor: Anchor) -> Float[Array, "height width"]:
+        """The log density of what an anchor believes, at each pixel's range."""
         near = log_density(anchor, ranging.distance_m, jnp.exp(self.log_anchor_depth), jnp.exp(self.log_anchor_limit))
-        return anchor, near * view.valid.astype(near.dtype)
+        return near * view.valid.astype(near.dtype)
 
     def _cut(
         self,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt8
 
 from ._numerics import safe_norm
+from .anchor import Anchor
 from .rf.reads import PhaseReads, RadioWindow
 from .segmentation import bounding_box
 
@@ -31,6 +32,14 @@ class Camera(eqx.Module):
         )
 
 
+class Later(eqx.Module):
+    """What all frames after one say of it, for every tag: a pass backwards in time leaves it for one forwards."""
+
+    log_odds: Float[Array, "*time tag height width"]  # of object against background
+    anchor: Anchor  # (*time, tag, antenna, ...): the tag's range at this frame
+    moved: Float[Array, "*time tag antenna"]  # the reads' evidence that the tag moves later on, nats
+
+
 class Frame(eqx.Module):
     """What a tracer sees at one frame; in a clip every leaf has a leading time axis.
 
@@ -46,6 +55,7 @@ class Frame(eqx.Module):
     radio: RadioWindow  # (*time, tag, antenna, window): causal, from reads up to this frame
     reads: PhaseReads  # (*time, tag, antenna, read): the reads that fall into this frame's window
     colour: UInt8[Array, "*time rows columns 3"] | None = None  # the whole picture, where flow is still to be computed
+    later: Later | None = None  # where the whole recording is known, as it is not to who watches
 
 
 class Trace(eqx.Module):
@@ -74,6 +84,14 @@ class AbstractTracer(eqx.Module):
     @abc.abstractmethod
     def finish(self, state: Any) -> Any:
         """The state handed on to whoever continues the recording: nothing in it refers to a past frame's buffer."""
+
+
+class AbstractSmoother(AbstractTracer):
+    """A tracer that can also go backwards through a recording and hand what it learns there to a pass forwards."""
+
+    @abc.abstractmethod
+    def look_back(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Later]:
+        """`step` where time runs backwards: the next state, and what all frames that come after this one say of it."""
 
 
 def trace(tracer: AbstractTracer, camera: Camera, clip: Frame) -> Trace:

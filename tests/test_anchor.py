@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tagjax.anchor import BIN_M, LEAK, Anchor, log_density, lost_drift_m, move_anchor, update_belief, votes
+from tagjax.anchor import BIN_M, LEAK, Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
 
 NUM_BINS, WINDOW = 60, 5
 WIDTH, UNSEEN = jnp.asarray(0.2), jnp.asarray(-1.0)
@@ -109,6 +109,36 @@ def test_the_density_is_bounded_and_continuous():
     assert said.min() >= -4.0
     assert np.abs(np.diff(said)).max() < 0.2
     assert np.linspace(-1.0, 9.0, 2001)[said.argmax()] == pytest.approx(20.5 * BIN_M, abs=BIN_M)
+
+
+def _normal(mean_m: float, std_m: float) -> jax.Array:
+    start = (jnp.arange(NUM_BINS, dtype=jnp.float32) + 0.5) * BIN_M
+    return jax.nn.log_softmax(-0.5 * jnp.square((start - mean_m) / std_m))
+
+
+def test_two_anchors_meet_at_the_range_that_both_allow():
+    """Of two normal beliefs of the range now the product is normal, by precision; each counts from a start of its own."""
+    past = Anchor(jnp.full(WINDOW, 0.4), _normal(2.1, 0.4))  # range now 2.5
+    later = Anchor(jnp.full(WINDOW, -0.83), _normal(3.93, 0.3))  # 3.1
+    found = joined(past, later)
+    range_m = float(found.travelled_m[-1]) + (np.arange(NUM_BINS) + 0.5) * BIN_M
+    probability = np.exp(found.belief)
+    precision = 0.4**-2 + 0.3**-2
+    mean = (2.5 * 0.4**-2 + 3.1 * 0.3**-2) / precision
+    np.testing.assert_allclose(probability.sum(), 1.0, atol=1e-5)
+    np.testing.assert_allclose(probability @ range_m, mean, atol=0.01)
+    np.testing.assert_allclose(
+        probability @ np.square(range_m - mean), 1.0 / precision, rtol=0.04
+    )  # between bins: linear
+
+
+def test_an_anchor_that_knows_nothing_changes_none():
+    known = Anchor(jnp.full(WINDOW, 0.3), _normal(2.0, 0.4))
+    found = joined(known, _fresh())
+    np.testing.assert_allclose(jnp.exp(found.belief), jnp.exp(known.belief), atol=1e-3)
+    # Where they contradict each other some range is left, so that something can still be the object.
+    against = joined(known, Anchor(jnp.zeros(WINDOW), _normal(5.0, 0.1)))
+    assert float(jnp.max(log_density(against, jnp.linspace(0.0, 6.0, 61)[None], WIDTH, jnp.asarray(4.0)))) > 1.0
 
 
 def test_gradients(gradients_agree):

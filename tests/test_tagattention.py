@@ -14,7 +14,7 @@ from tagjax.motion import empty_motion, push_gather, push_splat
 from tagjax.rf.reads import PhaseReads, RadioWindow
 from tagjax.tagattention import TagAttention, paper_limit
 from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
-from tagjax.tracer import Camera, Frame, describe, trace
+from tagjax.tracer import Camera, Frame, Later, describe, trace
 
 
 def _learnable(**changed):
@@ -370,7 +370,11 @@ def test_even_odds_are_no_claim():
 
 
 def test_only_frames_and_reads_enter(clip):
-    """A tracer's input holds no labels: what it says cannot depend on truth. (`colour` is for flow networks that learn.)"""
-    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour"} == set(
+    """A tracer's input holds no labels: what it says cannot depend on truth.
+
+    `colour` is for flow networks that learn; `later` is what such a pass backwards said.
+    """
+    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour", "later"} == set(
         Frame.__dataclass_fields__
     )
+    assert {"log_odds", "anchor", "moved"} == set(Later.__dataclass_fields__)

@@ -41,6 +41,8 @@ def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple
     """
     if first < 0 or last > recording.num_frames or first >= last:
         raise ValueError(f"Frames {first} to {last} asked for; {recording.name} has {recording.num_frames}.")
+    if recording.forwards is not None:
+        return _backwards(recording.forwards, first, last, method)
     key = flow_key(method)
     folder = _folder(recording, key)
     if folder is None:
@@ -56,6 +58,17 @@ def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple
             f"{folder}: the flow was written but cannot be read back. Remove the folder and look to the disk."
         )
     return held
+
+
+def _backwards(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """`pair_flow` of the recording played backwards: the same pairs, with the two ways exchanged."""
+    count = recording.num_frames
+    forward, backward = (np.zeros((last - first, *recording.colour.shape[1:3], 2), np.float32) for _ in _WAYS)
+    start = max(first, 1)
+    if start < last:
+        there, back = pair_flow(recording, count + 1 - last, count + 1 - start, method)
+        forward[start - first :], backward[start - first :] = back[::-1], there[::-1]
+    return forward, backward
 
 
 def _folder(recording: Recording, key: str) -> Path | None:

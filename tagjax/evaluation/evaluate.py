@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -13,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from ..data.backwards import played_backwards
 from ..recording import Recording, RecordingError
 from ..rf.reads import RadioWindow
-from ..tracer import AbstractTracer, Camera, Frame, Trace
+from ..tracer import AbstractSmoother, AbstractTracer, Camera, Frame, Later, Trace
 from . import metrics
 from .metrics import FrameScores, Scores
 
@@ -35,6 +37,7 @@ class ScoreSettings:
     mask_level: float = 0.5  # soft masks are cut here
     tags_at_once: int = 6
     frames_at_once: int = 48
+    smooth: bool = False  # say of a frame what those after it tell as well: twice the time, and not while it happens
     num_pictures: int = 12  # frames kept for overlay pictures, spread over the recording
 
 
@@ -110,6 +113,11 @@ def _init(tracer: AbstractTracer, camera: Camera, frame: Frame) -> Any:
 
 
 @eqx.filter_jit
+def _step_back(tracer: AbstractSmoother, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Later]:
+    return tracer.look_back(camera, state, frame)
+
+
+@eqx.filter_jit
 def _step(tracer: AbstractTracer, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
     return tracer.step(camera, state, frame)
 
@@ -142,6 +150,10 @@ def trace_recording(
     other with the tracer's state carried across, so that memory does not grow with the recording; tags go through in
     groups of `tags_at_once`, the last one filled up with silent ones, so that one compilation does for all. Tags compete for
     pixels within their group.
+
+    With `smooth` in the settings the frames go through backwards first, and what is said of a frame rests on those after
+    it as well; log odds are kept in half precision in a temporary file meanwhile. Raises `RecordingError` for a tracer
+    that is no `AbstractSmoother`.
     """
     settings = settings or ScoreSettings()
     first, last = frames or (0, recording.num_frames)
@@ -151,6 +163,29 @@ def trace_recording(
         )
     if not epcs:
         raise RecordingError(f"{recording.name}: no tag to trace. The recording holds no read, or epcs is empty.")
+    later: Callable[[int], Later] | None = None
+    if settings.smooth:
+        if not isinstance(tracer, AbstractSmoother):
+            raise RecordingError(
+                f"smooth: {type(tracer).__name__} goes forwards only; expected TagAttention. Set scores.smooth=false."
+            )
+        later = _look_back(tracer, recording, load, epcs, settings, (first, last))
+    for number, said in _run(_step, tracer, recording, load, epcs, settings, (first, last), later):
+        yield number, jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(epcs)], *said)
+
+
+def _run(
+    step: Callable[..., tuple[Any, Any]],
+    tracer: AbstractTracer,
+    recording: Recording,
+    load: Callable[..., Any],
+    epcs: Sequence[str],
+    settings: ScoreSettings,
+    frames: tuple[int, int],
+    later: Callable[[int], Later] | None = None,
+) -> Iterator[tuple[int, list[Any]]]:
+    """Every frame's number, and what a step says of each group of tags there (NumPy leaves)."""
+    first, last = frames
     size = min(settings.tags_at_once, len(epcs))
     groups = range(0, len(epcs), size)
     states: list[Any] = [None] * len(groups)
@@ -161,14 +196,46 @@ def trace_recording(
         parts = [_tags(clip.frames, group, size) for group in groups]
         for index in range(overlap, stop - start + overlap):
             said = []
+            known = later(start - overlap + index) if later is not None else None
             for number, part in enumerate(parts):
                 frame = jax.tree.map(lambda leaf, i=index: jnp.asarray(leaf[i]), part)
+                if known is not None:
+                    chosen = slice(groups[number], groups[number] + size)
+                    told = jax.tree.map(lambda leaf, part=chosen: jnp.asarray(leaf[part], jnp.float32), known)
+                    frame = eqx.tree_at(lambda one: one.later, frame, told, is_leaf=lambda leaf: leaf is None)
                 if states[number] is None:
                     states[number] = _init(tracer, clip.camera, frame)
-                states[number], out = _step(tracer, clip.camera, states[number], frame)
+                states[number], out = step(tracer, clip.camera, states[number], frame)
                 said.append(jax.tree.map(np.asarray, out))
-            together = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(epcs)], *said)
-            yield start - overlap + index, together
+            yield start - overlap + index, said
+
+
+def _look_back(
+    tracer: AbstractSmoother,
+    recording: Recording,
+    load: Callable[..., Any],
+    epcs: Sequence[str],
+    settings: ScoreSettings,
+    frames: tuple[int, int],
+) -> Callable[[int], Later]:
+    """Go through the frames backwards; what the later ones say of each can then be asked by its number.
+
+    Its tag axis is that of all groups, silent tags included.
+    """
+    count, (first, last) = recording.num_frames, frames
+    kept: dict[int, Later] = {}
+    log_odds: np.ndarray | None = None
+    for number, said in _run(
+        _step_back, tracer, played_backwards(recording), load, epcs, settings, (count - last, count - first)
+    ):
+        told: Later = jax.tree.map(lambda *leaves: np.concatenate(leaves), *said)
+        if log_odds is None:
+            with tempfile.TemporaryFile() as file:  # it has no name, and is gone when the array is
+                log_odds = np.memmap(file, np.float16, "w+", shape=(last - first, *told.log_odds.shape))
+        frame = count - 1 - number
+        log_odds[frame - first] = told.log_odds
+        kept[frame] = eqx.tree_at(lambda one: one.log_odds, told, log_odds[frame - first])
+    return kept.__getitem__
 
 
 def evaluate_recording(

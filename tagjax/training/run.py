@@ -13,14 +13,14 @@ import optax
 from rich.console import Console
 from rich.progress import track
 
-from ..config import ClipSettings, TrainConfig, build
+from ..config import ClipSettings, ConfigError, TrainConfig, build
 from ..data.clips import Clip, clip_dataset
 from ..evaluation.evaluate import RecordingResult, ScoreSettings, evaluate_recording
 from ..evaluation.report import plain, score_table, write_json, write_report
 from ..learned import load_parameters, save_parameters
 from ..recording import Recording
 from ..tagattention import TagAttention
-from ..tracer import AbstractTracer
+from ..tracer import AbstractSmoother, AbstractTracer
 from .checkpoint import Checkpoints
 from .flow_run import initial_network
 from .joint import JointModel, save_network
@@ -238,7 +238,9 @@ def evaluate_tracers(
 ) -> dict[str, Any]:
     """Run each tracer over each recording, write the report into `folder` and return its summary.
 
-    `estimators` and `flows` name the radio estimator and the flow of tracers that do not take the clips' own.
+    `estimators` and `flows` name the radio estimator and the flow of tracers that do not take the clips' own. With
+    `settings.smooth` those that can smooth do, which their names tell; the others go forwards only. Raises `ConfigError`
+    where none can.
     """
     estimators, flows = estimators or {}, flows or {}
     loaders = {
@@ -249,17 +251,23 @@ def evaluate_tracers(
         )
         for name in tracers
     }
+    forwards = dataclasses.replace(settings, smooth=False)
+    smooth = {name for name, tracer in tracers.items() if settings.smooth and isinstance(tracer, AbstractSmoother)}
+    if settings.smooth and not smooth:
+        kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
+        raise ConfigError(f"scores.smooth: {kinds} goes forwards only; expected TagAttention. Set scores.smooth=false.")
+    shown = {name: f"{name}_smoothed" if name in smooth else name for name in tracers}
     work = [(name, number) for name in tracers for number in range(len(recordings))]
-    results: dict[str, list[RecordingResult]] = {name: [] for name in tracers}
+    results: dict[str, list[RecordingResult]] = {shown[name]: [] for name in tracers}
     for name, number in track(work, description="evaluate", disable=not progress):
-        results[name].append(
+        results[shown[name]].append(
             evaluate_recording(
                 tracers[name],
                 recordings[number],
                 loaders[name],
                 stride=clips.stride,
                 epcs=epcs,
-                settings=settings,
+                settings=settings if name in smooth else forwards,
                 frames=frames,
             )
         )

@@ -15,7 +15,7 @@ from ...config import ClipSettings, ConfigError
 from ...data.store import open_recording
 from ...recording import Recording, RecordingError
 from ...sim.suites import Item
-from ...tracer import AbstractTracer, Trace
+from ...tracer import AbstractSmoother, AbstractTracer, Trace
 from ...training.run import make_tracer
 from ...training.sources import clip_loader
 from ..evaluate import ScoreSettings, trace_recording
@@ -113,7 +113,9 @@ class Systems:
         key = name, None if paper else way
         if key not in self._tracers:
             self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings.tracer)
-        return trace_recording(self._tracers[key], recording, clip_loader(clips), epcs=epcs, settings=self.scores)
+        tracer = self._tracers[key]
+        scores = dataclasses.replace(self.scores, smooth=self.scores.smooth and isinstance(tracer, AbstractSmoother))
+        return trace_recording(tracer, recording, clip_loader(clips), epcs=epcs, settings=scores)
 
     def _plane(self, item: Item, recording: Recording) -> PlaneCamera:
         """The camera as it was calibrated on the table, which both TagVision and Tagview take."""

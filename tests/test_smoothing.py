@@ -1,0 +1,224 @@
+"""Smoothing: recordings played backwards, and what later frames tell of earlier ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic_clips as synthetic
+
+from tagjax.config import ClipSettings, ConfigError
+from tagjax.data.backwards import played_backwards
+from tagjax.data.clips import Clip, load_clip
+from tagjax.data.flow_cache import pair_flow
+from tagjax.data.store import open_recording
+from tagjax.evaluation.evaluate import ScoreSettings, trace_recording
+from tagjax.recording import Recording, RecordingError
+from tagjax.tagattention import TagAttention
+from tagjax.tagattention_paper import TagAttentionPaper
+from tagjax.tracer import Camera, Frame, Later, Trace, trace
+from tagjax.training.run import evaluate_tracers
+
+EPCS = list(synthetic.EPCS)
+NUM_FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return synthetic.recording(NUM_FRAMES)
+
+
+def _tracer(**changed) -> TagAttention:
+    return TagAttention(**{"cell": 4, "alpha_m2": 1e-3, "prior_weight": 3.0, **changed})
+
+
+@eqx.filter_jit
+def _back(tracer: TagAttention, camera: Camera, frames: Frame) -> Later:
+    """What later frames say of each, in the order of time; `frames` go backwards."""
+    first = jax.tree.map(lambda leaf: leaf[0], frames)
+    step = lambda state, frame: tracer.look_back(camera, state, frame)  # noqa: E731
+    _, told = jax.lax.scan(step, tracer.init(camera, first), frames)
+    return jax.tree.map(lambda leaf: leaf[::-1], told)
+
+
+def _outlines(mask: np.ndarray, box: tuple[int, int, int, int]) -> float:
+    x0, y0, x1, y1 = box
+    inside = np.zeros(mask.shape, bool)
+    inside[y0 : y1 + 1, x0 : x1 + 1] = True
+    return float(((mask > 0.5) & inside).sum() / ((mask > 0.5) | inside).sum())
+
+
+def test_twice_backwards_is_forwards(recording: Recording) -> None:
+    back = played_backwards(recording)
+    back.check()
+    again = played_backwards(back)
+    np.testing.assert_array_equal(again.time_ns, recording.time_ns)
+    for field in dataclasses.fields(recording.reads):
+        np.testing.assert_array_equal(getattr(again.reads, field.name), getattr(recording.reads, field.name))
+    for frames, turned, once_more in (
+        (recording.colour, back.colour, again.colour),
+        (recording.depth, back.depth, again.depth),
+    ):
+        np.testing.assert_array_equal(turned[:], frames[:][::-1])
+        np.testing.assert_array_equal(turned[3:7], frames[:][::-1][3:7])
+        np.testing.assert_array_equal(turned[2], frames[NUM_FRAMES - 3])
+        np.testing.assert_array_equal(turned[-1], frames[0])
+        np.testing.assert_array_equal(once_more[5:], frames[5:])
+        assert turned[7:3].shape == frames[7:3].shape
+        with pytest.raises(IndexError, match="Frame 20 of 20"):
+            turned[20]
+        with pytest.raises(IndexError, match="neighbouring"):
+            turned[::2]
+
+
+def test_a_clock_that_goes_backwards_turns_doppler_and_keeps_phases(recording: Recording) -> None:
+    reads = dataclasses.replace(
+        recording.reads,
+        doppler_hz=np.arange(recording.reads.num_reads, dtype=np.float32),
+        reader_time_ns=recording.reads.time_ns + 5,
+    )
+    back = played_backwards(recording.with_reads(reads)).reads
+    back.check()
+    np.testing.assert_array_equal(back.phase_rad, reads.phase_rad[::-1])
+    np.testing.assert_array_equal(back.doppler_hz, -reads.doppler_hz[::-1])
+    np.testing.assert_array_equal(np.diff(back.time_ns), np.diff(reads.time_ns)[::-1])
+    assert back.reader_time_ns is not None
+    np.testing.assert_array_equal(np.diff(back.reader_time_ns), np.diff(back.time_ns))
+
+
+def test_flow_backwards_is_the_same_pairs_the_other_way_round() -> None:
+    rng = np.random.default_rng(0)
+    picture = np.kron(rng.integers(0, 255, (12, 16, 3)), np.ones((6, 6, 1))).astype(np.uint8)
+    colour = np.stack([np.roll(picture, 2 * t * t, axis=1) for t in range(5)])
+    size = {"height": picture.shape[0], "width": picture.shape[1]}
+    still = synthetic.recording(5)
+    recording = dataclasses.replace(
+        still,
+        colour=colour,
+        depth=np.ones(colour.shape[:3], np.float32),
+        intrinsics=dataclasses.replace(still.intrinsics, **size),
+        truth=None,
+    )
+    back = played_backwards(recording)
+    # The same pictures as a recording of its own: DIS does not know which way time runs.
+    alone = dataclasses.replace(back, forwards=None)
+    for first, last in ((0, 5), (0, 1), (2, 4)):
+        for turned, expected in zip(
+            pair_flow(back, first, last, "dis"), pair_flow(alone, first, last, "dis"), strict=True
+        ):
+            assert turned.shape == expected.shape
+            np.testing.assert_array_equal(turned, expected)
+    assert np.abs(pair_flow(back, 0, 5, "dis")[0]).max() > 1.0
+
+
+def test_the_radio_backwards_tells_the_distances_backwards(recording: Recording) -> None:
+    """By an independent way: the reads of the turned recording give the truth's differences, frames reversed."""
+    clip = load_clip(played_backwards(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
+    truth = load_clip(played_backwards(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS, estimator="truth")
+    time_s = recording.frame_time_s()
+    for tag, label in enumerate(synthetic.BOXES):
+        travelled = synthetic.offset_m(label, time_s)[::-1]
+        step = np.asarray(clip.frames.radio.relative_m[6:, tag, 0, -1])
+        np.testing.assert_allclose(step, travelled[6:] - travelled[2:-4], atol=6e-3)
+        np.testing.assert_allclose(
+            truth.frames.radio.relative_m[6:, tag, 0, -1], travelled[6:] - travelled[2:-4], atol=1e-6
+        )
+
+
+def test_past_and_future_add_up_to_all_there_is(recording: Recording) -> None:
+    """Where nothing fades or is bounded and motion is seen pair by pair, their sum is the same at every frame."""
+    tracer = _tracer(
+        memory_s=1e9, evidence_limit=1e6, phase_weight=1e-12, coherent_weight=1e-12, anchor_rate=1e-12, v0_m_s=1e-6
+    )  # fmt: skip
+    settings = {"stride": 1, "flow": "zero", "epcs": EPCS, "estimator": "truth", "window": 2}
+    ways = [load_clip(one, 0, NUM_FRAMES, **settings) for one in (recording, played_backwards(recording))]
+    forwards = eqx.filter_jit(
+        lambda frames: jax.lax.scan(
+            lambda state, frame: (after := tracer.step(ways[0].camera, state, frame)[0], after.log_odds),
+            tracer.init(ways[0].camera, jax.tree.map(lambda leaf: leaf[0], frames)),
+            frames,
+        )[1]
+    )(ways[0].frames)
+    later = _back(tracer, ways[1].camera, ways[1].frames).log_odds
+    total = np.asarray(forwards + later)
+    scale = np.abs(total).max()
+    assert scale > 5.0
+    np.testing.assert_allclose(total, np.broadcast_to(total[-1:], total.shape), atol=2e-4 * scale)
+    np.testing.assert_allclose(total[-1], forwards[-1], atol=2e-4 * scale)
+
+
+def _load(one: Recording, start: int, stop: int, *, epcs: Sequence[str]) -> Clip:
+    return load_clip(one, start, stop, stride=1, flow="zero", epcs=epcs)
+
+
+def test_the_first_frame_shows_what_the_later_ones_tell(recording: Recording) -> None:
+    """Whoever only looks forwards knows nothing yet."""
+    settings = ScoreSettings(frames_at_once=7)
+
+    def said(smooth: bool, first: int, last: int) -> list[tuple[int, Trace]]:
+        chosen = dataclasses.replace(settings, smooth=smooth)
+        return list(trace_recording(_tracer(), recording, _load, epcs=EPCS, settings=chosen, frames=(first, last)))
+
+    ((_, filtered),) = said(False, 0, 1)
+    for first, last in ((0, NUM_FRAMES), (2, 15)):
+        smoothed = said(True, first, last)
+        assert [number for number, _ in smoothed] == list(range(first, last))
+        for tag, box in enumerate(synthetic.BOXES.values()):
+            assert _outlines(smoothed[0][1].mask[tag], box) > 0.6
+            assert smoothed[0][1].found[tag]
+            assert np.mean([_outlines(out.mask[tag], box) for _, out in smoothed]) > 0.6
+    for tag, box in enumerate(synthetic.BOXES.values()):
+        assert _outlines(filtered.mask[tag], box) < 0.3
+        assert not filtered.found[tag]
+
+
+@pytest.mark.slow
+def test_pieces_and_groups_give_what_two_scans_give(recording: Recording) -> None:
+    tracer = _tracer(rivalry=1e-12)  # so that tags can be traced one at a time
+    settings = ScoreSettings(frames_at_once=7, tags_at_once=1, smooth=True)
+    pieces = list(trace_recording(tracer, recording, _load, epcs=EPCS, settings=settings))
+    clip, turned = (_load(one, 0, NUM_FRAMES, epcs=EPCS) for one in (recording, played_backwards(recording)))
+    later = _back(tracer, turned.camera, turned.frames)
+    whole = eqx.filter_jit(trace)(tracer, clip.camera, dataclasses.replace(clip.frames, later=later))
+    for number, out in pieces:
+        np.testing.assert_allclose(out.mask, whole.mask[number], atol=0.02)  # half precision in between
+        np.testing.assert_allclose(out.confidence, whole.confidence[number], atol=0.01)
+
+
+@pytest.mark.slow
+def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
+    clip = load_clip(recording, 0, 6, stride=1, flow="zero", epcs=EPCS)
+    turned = load_clip(played_backwards(recording), NUM_FRAMES - 6, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
+
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def gradient(tracer):
+        later = _back(tracer, turned.camera, turned.frames)
+        return jnp.mean(trace(tracer, clip.camera, dataclasses.replace(clip.frames, later=later)).mask)
+
+    leaves = [leaf for leaf in jax.tree.leaves(gradient(_tracer())) if leaf is not None]
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
+    assert any(float(jnp.abs(leaf).max()) > 0 for leaf in leaves)
+
+
+def test_who_goes_forwards_only_is_told_so_and_reported_beside(tmp_path: Path) -> None:
+    recording = open_recording(synthetic.stored(tmp_path, 8)[0])
+    settings = ScoreSettings(smooth=True, num_pictures=1, moved_for_s=0.2)
+    with pytest.raises(RecordingError, match="TagAttentionPaper goes forwards only; expected TagAttention"):
+        next(trace_recording(TagAttentionPaper(), recording, _load, epcs=EPCS, settings=settings))
+    common = {
+        "recordings": [recording],
+        "clips": ClipSettings(stride=4, flow="zero"),
+        "settings": settings,
+        "progress": False,
+    }
+    with pytest.raises(ConfigError, match=r"scores.smooth: TagAttentionPaper goes forwards only"):
+        evaluate_tracers({"paper": TagAttentionPaper()}, folder=tmp_path, **common)
+    summary = evaluate_tracers({"here": _tracer(), "paper": TagAttentionPaper()}, folder=tmp_path, **common)
+    assert set(summary) == {"here_smoothed", "paper"}
