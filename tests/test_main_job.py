@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import EvaluateConfig, TrainConfig, VirtualTagSettings, from_mapping
+from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, VirtualTagSettings, from_mapping
 from tagjax.data.store import save_recording
 from tagjax.evaluation.run import run_evaluation
 from tagjax.recording import RecordingError, TagReads
@@ -77,6 +77,28 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
     assert set(held_out) == {"learned"}
     with (tmp_path / "part" / "frames.csv").open() as file:
         assert len(file.readlines()) == 1 + 2 * 9
+
+
+def test_smoothing_that_the_tracer_cannot_do_is_refused_before_the_work(recordings: list[str], tmp_path: Path) -> None:
+    values = _values(recordings)
+    values["scores"]["smooth"] = True
+    with pytest.raises(ConfigError, match=r"scores\.smooth: TagAttentionPaper goes forwards only"):
+        run_training(from_mapping(TrainConfig, values), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_run_may_be_scored_smoothed(recordings: list[str], tmp_path: Path) -> None:
+    values = _values(recordings)
+    values["scores"]["smooth"] = True
+    values["baselines"] = {"paper": values["tracer"]}
+    values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+    values["loop"]["num_steps"] = 1
+    score = run_training(from_mapping(TrainConfig, values), tmp_path)
+    summary = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(summary) == {"learned_smoothed", "untrained_smoothed", "paper"}
+    assert summary["learned_smoothed"]["all"]["iou"] == pytest.approx(score)
+    assert list((tmp_path / "report" / "overlays").glob("*/learned_smoothed/*.png"))
 
 
 def test_the_same_recording_cannot_be_held_out(recordings: list[str], tmp_path: Path) -> None:

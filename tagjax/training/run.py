@@ -84,6 +84,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     several processes (`config.distributed`) the first writes and evaluates; the others return NaN.
     """
     console = console or Console()
+    smoothed({"learned": make_tracer(config.tracer)}, config.scores)
     with joined(config.distributed):
         console.quiet = console.quiet or not is_first()
         training, validation = training_recordings(config.data)
@@ -100,11 +101,12 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
             console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
             return float("nan")
         summary = _report(config, folder, trained.state, validation)
-        logger.report(folder / "report", summary["learned"]["all"], tracer="learned")
+        first_name, found = next(iter(summary.items()))  # the learned tracer's, smoothed or not
+        logger.report(folder / "report", found["all"], tracer=first_name)
     finally:
         logger.close()
     console.print(score_table(summary, title="held-out recordings"))
-    iou = summary["learned"]["all"].get("iou")
+    iou = found["all"].get("iou")
     if iou is not None:
         return float(iou)
     return held_out_numbers(trained.state, held_out_clips(config, validation), config)["own_coherence"]
@@ -223,6 +225,15 @@ def held_out_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list
     return clips
 
 
+def smoothed(tracers: Mapping[str, AbstractTracer], settings: ScoreSettings) -> set[str]:
+    """Names of the tracers that go backwards first: with `settings.smooth` all that can. Raises `ConfigError` if none can."""
+    names = {name for name, tracer in tracers.items() if settings.smooth and isinstance(tracer, AbstractSmoother)}
+    if settings.smooth and not names:
+        kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
+        raise ConfigError(f"scores.smooth: {kinds} goes forwards only; expected TagAttention. Set scores.smooth=false.")
+    return names
+
+
 def evaluate_tracers(
     tracers: Mapping[str, AbstractTracer],
     recordings: Sequence[Recording],
@@ -252,10 +263,7 @@ def evaluate_tracers(
         for name in tracers
     }
     forwards = dataclasses.replace(settings, smooth=False)
-    smooth = {name for name, tracer in tracers.items() if settings.smooth and isinstance(tracer, AbstractSmoother)}
-    if settings.smooth and not smooth:
-        kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
-        raise ConfigError(f"scores.smooth: {kinds} goes forwards only; expected TagAttention. Set scores.smooth=false.")
+    smooth = smoothed(tracers, settings)
     shown = {name: f"{name}_smoothed" if name in smooth else name for name in tracers}
     work = [(name, number) for name in tracers for number in range(len(recordings))]
     results: dict[str, list[RecordingResult]] = {shown[name]: [] for name in tracers}
