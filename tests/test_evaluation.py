@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import json
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
+from rich.console import Console
 
 from tagjax.evaluation.evaluate import (
     ScoreSettings,
@@ -182,6 +184,15 @@ def test_report_is_complete(tmp_path: Path) -> None:
     assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 3  # something is drawn on the uniform grey
     assert len(list((tmp_path / "curves").glob("*.png"))) == 2
     assert score_table(summary).row_count == 2
+
+
+def test_the_table_fits_a_terminal_of_eighty_columns() -> None:
+    summary = {"learned_smoothed": {"all": {"iou": 0.64172, "cle_px": 21.93, "mask_j": 2.25e-4, "num_frames": 1065}}}
+    console = Console(width=80, record=True, quiet=False, file=io.StringIO())
+    console.print(score_table(summary))
+    shown = console.export_text()
+    for told in ("learned_smoothed", "0.642", "21.9", "0.000", "1065", "frames"):
+        assert told in shown
 
 
 def test_plain_json_has_no_nan() -> None:

@@ -159,14 +159,23 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
     }
     if any(scores["all"].get("false_claims") is not None for scores in summary.values()):
         columns["false_claims"] = "false"
-    table = Table(title=title, box=SIMPLE, pad_edge=False)
+    rows = [[_cell(scores["all"].get(name)) for name in columns] for scores in summary.values()]
+    table = Table(title=title, box=SIMPLE, pad_edge=False, collapse_padding=True)
     table.add_column("tracer", no_wrap=True)
-    for heading in columns.values():
-        table.add_column(heading, justify="right", no_wrap=True, min_width=len(heading))
-    for tracer, scores in summary.items():
-        values = [scores["all"].get(name) for name in columns]
-        table.add_row(tracer, *("-" if v is None else f"{v:d}" if isinstance(v, int) else f"{v:.3g}" for v in values))
+    for heading, *cells in zip(columns.values(), *rows, strict=True):
+        table.add_column(heading, justify="right", no_wrap=True, min_width=max(map(len, (heading, *cells))))
+    for tracer, row in zip(summary, rows, strict=True):
+        table.add_row(tracer, *row)
     return table
+
+
+def _cell(value: float | int | None) -> str:
+    """Three digits; of what is below one, three places, so that columns stay narrow."""
+    if value is None:
+        return "-"
+    if isinstance(value, int):
+        return f"{value:d}"
+    return f"{value:.3f}" if 0 < abs(value) < 1 else f"{value:.3g}"
 
 
 def _recording_name(results: Sequence[RecordingResult], number: int) -> str:
