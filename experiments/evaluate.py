@@ -2,7 +2,7 @@
 
 python -m experiments.evaluate run=outputs/train/<time> 'recordings=[c.zarr]'
 python -m experiments.evaluate tracer=tagattention_paper 'recordings=[c.zarr]' 'frames=[0,200]' stride=2
-python -m experiments.evaluate run=<folder> 'recordings=[c.zarr]' virtual_tag.tracks=tracks.csv 'virtual_tag.seeds=[0,1]'
+python -m experiments.evaluate run=<folder> 'recordings=[c.zarr]' virtual_tag.tracks=tracks.csv 'virtual_tag.seeds=[0]'
 """
 
 from __future__ import annotations
