@@ -448,8 +448,12 @@ class TagAttention(AbstractSmoother):
         Up to this frame and from it on motion and reads are different ones, so their log odds add up; anchors per antenna.
         """
         log_odds = soft_clip(belief.log_odds + later.log_odds, jnp.exp(self.log_evidence_limit))
-        both = jax.vmap(joined)(anchor, later.anchor)
-        _, nears = of_each_antenna(lambda ranging, one: (one, self._near(view, ranging, one)), view.ranging, both)
+        nears = of_each_antenna(
+            lambda ranging, past, future: self._near(view, ranging, joined(past, future)),
+            view.ranging,
+            anchor,
+            later.anchor,
+        )
         return Belief(*self._spread(view, log_odds), jnp.sum(nears, axis=0))
 
     def _locate(

@@ -40,6 +40,10 @@ class ScoreSettings:
     smooth: bool = False  # say of a frame what those after it tell as well: twice the time, and not while it happens
     num_pictures: int = 12  # frames kept for overlay pictures, spread over the recording
 
+    def able(self, tracer: AbstractTracer) -> ScoreSettings:
+        """These, without smoothing for a tracer that goes forwards only."""
+        return dataclasses.replace(self, smooth=self.smooth and isinstance(tracer, AbstractSmoother))
+
 
 @dataclasses.dataclass(frozen=True)
 class Picture:

@@ -20,7 +20,7 @@ from ..evaluation.report import plain, score_table, write_json, write_report
 from ..learned import load_parameters, save_parameters
 from ..recording import Recording
 from ..tagattention import TagAttention
-from ..tracer import AbstractSmoother, AbstractTracer
+from ..tracer import AbstractTracer
 from .checkpoint import Checkpoints
 from .flow_run import initial_network
 from .joint import JointModel, save_network
@@ -227,7 +227,7 @@ def held_out_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list
 
 def smoothed(tracers: Mapping[str, AbstractTracer], settings: ScoreSettings) -> set[str]:
     """Names of the tracers that go backwards first: with `settings.smooth` all that can. Raises `ConfigError` if none can."""
-    names = {name for name, tracer in tracers.items() if settings.smooth and isinstance(tracer, AbstractSmoother)}
+    names = {name for name, tracer in tracers.items() if settings.able(tracer).smooth}
     if settings.smooth and not names:
         kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
         raise ConfigError(f"scores.smooth: {kinds} goes forwards only; expected TagAttention. Set scores.smooth=false.")
@@ -262,7 +262,6 @@ def evaluate_tracers(
         )
         for name in tracers
     }
-    forwards = dataclasses.replace(settings, smooth=False)
     smooth = smoothed(tracers, settings)
     shown = {name: f"{name}_smoothed" if name in smooth else name for name in tracers}
     work = [(name, number) for name in tracers for number in range(len(recordings))]
@@ -275,7 +274,7 @@ def evaluate_tracers(
                 loaders[name],
                 stride=clips.stride,
                 epcs=epcs,
-                settings=settings if name in smooth else forwards,
+                settings=settings.able(tracers[name]),
                 frames=frames,
             )
         )

@@ -15,7 +15,7 @@ from ...config import ClipSettings, ConfigError
 from ...data.store import open_recording
 from ...recording import Recording, RecordingError
 from ...sim.suites import Item
-from ...tracer import AbstractSmoother, AbstractTracer, Trace
+from ...tracer import AbstractTracer, Trace
 from ...training.run import make_tracer
 from ...training.sources import clip_loader
 from ..evaluate import ScoreSettings, trace_recording
@@ -114,8 +114,7 @@ class Systems:
         if key not in self._tracers:
             self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings.tracer)
         tracer = self._tracers[key]
-        scores = dataclasses.replace(self.scores, smooth=self.scores.smooth and isinstance(tracer, AbstractSmoother))
-        return trace_recording(tracer, recording, clip_loader(clips), epcs=epcs, settings=scores)
+        return trace_recording(tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.able(tracer))
 
     def _plane(self, item: Item, recording: Recording) -> PlaneCamera:
         """The camera as it was calibrated on the table, which both TagVision and Tagview take."""
