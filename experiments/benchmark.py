@@ -17,6 +17,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -30,7 +31,8 @@ def main(config: DictConfig) -> None:
 
     console = Console(width=None if sys.stdout.isatty() else 140)  # a file has no width of its own
     timings = []
-    settings = from_mapping(BenchmarkSettings, resolved(config))
+    with in_a_line("benchmark"):
+        settings = from_mapping(BenchmarkSettings, resolved(config))
     written = Path(HydraConfig.get().runtime.output_dir) / "benchmark.json"
     table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s", "memory, MiB")
     with console.status("measuring") as status:

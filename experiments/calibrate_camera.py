@@ -11,6 +11,7 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -25,12 +26,10 @@ def main(config: DictConfig) -> None:
     if values["pictures"] is None:
         raise SystemExit("calibrate_camera: give pictures=<folder of pictures of the checkerboard>.")
     console = Console(soft_wrap=True, highlight=False)
-    try:
+    with in_a_line("calibrate_camera"):
         settings = from_mapping(CalibrateSettings, values)
         found = calibrate_folder(settings)
-    except ValueError as error:
-        raise SystemExit(f"calibrate_camera: {error}") from error
-    write_calibration(found, settings.out)
+        write_calibration(found, settings.out)
     for line in (*found.said(), f"written to {settings.out}"):
         console.print(line, markup=False)
 

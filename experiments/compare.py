@@ -17,6 +17,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -43,12 +44,10 @@ def main(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create({"suites": names, **values}), folder / "config.yaml")
     console = Console()
-    try:
+    with in_a_line("compare"):
         checked = from_mapping(CompareConfig, {**values, "suites": suites_named(names)})
         with console.status("comparing") as status:
             cells = run_comparison(checked, folder, on_progress=status.update if progress else None)
-    except ValueError as error:
-        raise SystemExit(f"compare: {error}") from error
     console.print(console_table(cells))
     console.print(f"table.md, table.csv, table.json and comparison.png in {folder}", soft_wrap=True, highlight=False)
     print(json.dumps(plain([dataclasses.asdict(cell) for cell in cells]), allow_nan=False))

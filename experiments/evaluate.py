@@ -15,6 +15,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -39,10 +40,11 @@ def main(config: DictConfig) -> float:
     from tagjax.evaluation.run import run_evaluation
 
     values = resolved(config)
-    checked = from_mapping(EvaluateConfig, values)
     folder = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
-    summary = run_evaluation(checked, folder, run_values=run_configuration(checked.run))
+    with in_a_line("evaluate"):
+        checked = from_mapping(EvaluateConfig, values)
+        OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+        summary = run_evaluation(checked, folder, run_values=run_configuration(checked.run))
     Console().print(score_table(summary, title=f"report: {folder}"))
     print(json.dumps(plain(summary), allow_nan=False))
     first = next(iter(summary.values()))["all"].get("iou")

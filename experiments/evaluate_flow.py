@@ -14,6 +14,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -29,10 +30,8 @@ def main(config: DictConfig) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
     console = Console()
-    try:
+    with in_a_line("evaluate_flow"):
         summary = evaluate_flows(from_mapping(FlowEvaluationSettings, values), folder)
-    except ValueError as error:
-        raise SystemExit(f"evaluate_flow: {error}") from error
     for table in flow_tables(summary):
         console.print(table)
     console.print(f"report: {folder}", soft_wrap=True, highlight=False)

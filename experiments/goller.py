@@ -15,6 +15,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -27,11 +28,11 @@ def main(config: DictConfig) -> None:
     from tagjax.evaluation.goller import GollerConfig, run_goller
 
     values = resolved(config)
-    checked = from_mapping(GollerConfig, values)
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
     console = Console()
-    with console.status("observing", spinner="line") as status:
+    with in_a_line("goller"), console.status("observing", spinner="line") as status:
+        checked = from_mapping(GollerConfig, values)
         metrics = run_goller(checked, open_recording, folder, on_done=lambda name: status.update(f"observed {name}"))
     console.print((folder / "tables.md").read_text(), markup=False)
     console.print(f"run folder: {folder}")

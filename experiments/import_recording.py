@@ -10,6 +10,7 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -19,13 +20,10 @@ def main(config: DictConfig) -> None:
 
     from tagjax.config import from_mapping
     from tagjax.data.importers.settings import ImportSettings, import_recording
-    from tagjax.recording import RecordingError
 
     console = Console(soft_wrap=True, highlight=False)
-    try:
+    with in_a_line("import_recording"):
         _, said = import_recording(from_mapping(ImportSettings, resolved(config)))
-    except RecordingError as error:
-        raise SystemExit(f"import_recording: {error}") from error
     for line in said:
         console.print(line, markup=False)
 

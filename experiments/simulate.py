@@ -11,6 +11,7 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -22,7 +23,6 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
 
     from tagjax.config import SimulateConfig, from_mapping
-    from tagjax.recording import RecordingError
     from tagjax.sim.suites import Suite, make_suite
     from tagjax.viz.contact_sheet import save_glance, save_sheet
 
@@ -32,8 +32,9 @@ def main(config: DictConfig) -> None:
     sheets = values.pop("sheet", None)
     if values.get("benchmark") is None:
         raise SystemExit("simulate: name a suite: benchmark=<name>. `--help` lists them.")
-    checked = from_mapping(SimulateConfig, values)
-    suite = from_mapping(Suite, checked.benchmark, where="benchmark")
+    with in_a_line("simulate"):
+        checked = from_mapping(SimulateConfig, values)
+        suite = from_mapping(Suite, checked.benchmark, where="benchmark")
     suite = suite.smoke() if checked.smoke else suite
     console = Console()
     if sheets is not None:
@@ -44,15 +45,13 @@ def main(config: DictConfig) -> None:
         task = bar.add_task(suite.name, total=total)
         here = sum(item.path(Path(checked.out)).exists() for item in suite.items())
         bar.update(task, completed=here)
-        try:
+        with in_a_line("simulate"):
             made = make_suite(
                 suite,
                 Path(checked.out),
                 workers=checked.workers or os.cpu_count() or 1,
                 on_done=lambda one: bar.update(task, advance=1, description=one.name),
             )
-        except (RecordingError, ValueError) as error:
-            raise SystemExit(f"simulate: {error}") from error
     frames, elapsed_s = sum(one.num_frames for one in made), sum(one.elapsed_s for one in made)
     pace = f", {frames / elapsed_s:.1f} frames/s a process" if frames else ""
     sheet = save_sheet(suite, Path(checked.out))

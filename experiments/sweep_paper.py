@@ -18,6 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from .compare import suites_named
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -42,11 +43,9 @@ def main(config: DictConfig) -> float:
         def tell(done: int, total: int, name: str) -> None:
             bar.update(task, completed=done, total=total or None, description=name)
 
-        try:
+        with in_a_line("sweep_paper"):
             checked = from_mapping(SweepConfig, {**values, "suites": suites_named(names)})
             lines = run_sweep(checked, folder, on_progress=tell)
-        except ValueError as error:
-            raise SystemExit(f"sweep_paper: {error}") from error
     rows = table(lines)
     console.print((folder / "table.md").read_text(), soft_wrap=True, highlight=False)
     console.print(f"table.md, table.csv, sweep.png, lines.jsonl in {folder}", soft_wrap=True, highlight=False)

@@ -16,6 +16,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -35,7 +36,7 @@ def main(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create({"command": command, **values}), folder / "config.yaml")
     console = Console()
-    try:
+    with in_a_line("tagview"):
         checked = from_mapping(TagviewExperiment, values)
         with Progress(console=console, disable=not progress) as bar:
             task = bar.add_task("tagview", total=None)
@@ -56,8 +57,6 @@ def main(config: DictConfig) -> None:
                         task, completed=number, total=total, description=name
                     ),
                 )
-    except ValueError as error:
-        raise SystemExit(f"tagview: {error}") from error
     if command == "run":
         console.print(Markdown(table(metrics)))
     console.print(f"all of it in {folder}", soft_wrap=True, highlight=False)

@@ -14,6 +14,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -30,12 +31,10 @@ def main(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
     console = Console()
-    try:
+    with in_a_line("tagvision"):
         checked = from_mapping(TagVisionExperiment, values)
         with console.status("TagVision") as status:
             metrics = run_tagvision(checked, folder, on_progress=status.update if progress else None)
-    except ValueError as error:
-        raise SystemExit(f"tagvision: {error}") from error
     console.print(Markdown(table(metrics)))
     console.print(f"plots, table.md and metrics.json in {folder}", soft_wrap=True, highlight=False)
     print(json.dumps(metrics, allow_nan=False))

@@ -12,6 +12,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -21,7 +22,6 @@ def main(config: DictConfig) -> None:
 
     from tagjax.config import from_mapping
     from tagjax.evaluation.tracks import TracksConfig, run_tracks
-    from tagjax.recording import RecordingError
 
     values = resolved(config)
     if values.get("folder") is None:
@@ -29,11 +29,8 @@ def main(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
     console = Console()
-    try:
-        with console.status("scoring", spinner="line") as status:
-            run_tracks(from_mapping(TracksConfig, values), folder, on_done=status.update)
-    except (RecordingError, ValueError) as error:
-        raise SystemExit(f"tracks: {error}") from error
+    with in_a_line("tracks"), console.status("scoring", spinner="line") as status:
+        run_tracks(from_mapping(TracksConfig, values), folder, on_done=status.update)
     console.print((folder / "tables.md").read_text(), markup=False)
     console.print(f"run folder: {folder}")
 

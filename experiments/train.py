@@ -16,6 +16,8 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
+
 CONFIGS = str(Path(__file__).resolve().parents[1] / "conf")
 
 
@@ -53,13 +55,15 @@ OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train")
 def main(config: DictConfig) -> float:
     from tagjax.config import TrainConfig, from_mapping
+    from tagjax.training.loop import DivergedError
     from tagjax.training.run import run_training
 
     values = resolved(config)
-    checked = from_mapping(TrainConfig, values)
     folder = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
-    score = run_training(checked, folder)
+    with in_a_line("train", DivergedError):
+        checked = from_mapping(TrainConfig, values)
+        OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+        score = run_training(checked, folder)
     print(f"run folder: {folder}")
     return score
 

@@ -1,7 +1,7 @@
 """Train an optical-flow network without labels: on drawn pairs, recordings, videos and folders of pictures.
 
 python -m experiments.train_flow
-python -m experiments.train_flow init=default recipe=fine_tune 'data.sequences=[my_video.mp4]'
+python -m experiments.train_flow recipe=fine_tune 'data.sequences=[my_video.mp4]'
 python -m experiments.train_flow recipe=raft
 """
 
@@ -13,6 +13,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from .errors import in_a_line
 from .train import CONFIGS, resolved
 
 
@@ -20,12 +21,14 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> float:
     from tagjax.config import TrainFlowConfig, from_mapping
     from tagjax.training.flow_run import run_flow_training
+    from tagjax.training.loop import DivergedError
 
     values = resolved(config)
-    checked = from_mapping(TrainFlowConfig, values)
     folder = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
-    score = run_flow_training(checked, folder)
+    with in_a_line("train_flow", DivergedError):
+        checked = from_mapping(TrainFlowConfig, values)
+        OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+        score = run_flow_training(checked, folder)
     print(f"run folder: {folder}")
     return score
 

@@ -1,0 +1,34 @@
+"""How a command says what is wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+
+
+@contextlib.contextmanager
+def in_a_line(command: str, *more: type[Exception]) -> Iterator[None]:
+    """What the user can mend (`ValueError`, a missing file, and `more`) and Ctrl-C end the command with one line.
+
+    The exit status is 1, and 130 after Ctrl-C. HYDRA_FULL_ERROR=1 shows where it happened; the jobs of a sweep raise as
+    ever, so that Hydra tells failed ones from others.
+    """
+    try:
+        yield
+    except (ValueError, FileNotFoundError, *more) as error:
+        if os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0") or _sweeping():
+            raise
+        raise SystemExit(f"{command}: {error}") from error
+    except KeyboardInterrupt:
+        if _sweeping():
+            raise
+        print(f"\n{command}: interrupted.", flush=True)
+        raise SystemExit(130) from None
+
+
+def _sweeping() -> bool:
+    return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
