@@ -139,11 +139,13 @@ class TrainFlowConfig:
 
     flow: Mapping[str, Any]
     optimizer: Mapping[str, Any]
-    init: str | None = None  # weights to begin with: `default` or a file; random ones if None
+    weights: str | None = None  # to begin with: `default` or a file; random ones if None
     seed: int = 0
     clip_norm: float = 1.0
     average_over: int = 500  # steps that the kept weights are a running average of
-    matmul_precision: str | None = None  # of JAX: on GPUs `tensorfloat32` is its default, `bfloat16` faster
+    matmul_precision: Literal["bfloat16", "tensorfloat32", "float32"] | None = (
+        None  # of products; None is JAX's default
+    )
     resume: bool = True
     data: FlowDataSettings = dataclasses.field(default_factory=FlowDataSettings)
     loss: FlowLossSettings = dataclasses.field(default_factory=FlowLossSettings)

@@ -545,9 +545,17 @@ def configured(tmp_path: Path, **more) -> TrainFlowConfig:
 
 @pytest.mark.slow
 def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> None:
-    score = run_flow_training(configured(tmp_path), tmp_path / "run")
+    (tmp_path / "walk").mkdir()
+    for number in range(3):  # one picture, shifted by two pixels each time
+        shifted = np.roll(smooth_pictures(1, 64, 80)[0], 2 * number, axis=1)
+        cv2.imwrite(str(tmp_path / "walk" / f"{number}.png"), shifted)
+    config = configured(tmp_path)
+    config = dataclasses.replace(config, data=dataclasses.replace(config.data, sequences=(str(tmp_path / "walk"),)))
+    score = run_flow_training(config, tmp_path / "run")
     told = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert told["steps"] == 5
+    assert set(told["warped_levels"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
+    assert told["warped_levels"]["dis"] < 0.5 * told["warped_levels"]["zero"]
     assert set(told["epe_px"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
     np.testing.assert_allclose(score, told["epe_px"]["learned"]["all"])
     assert (tmp_path / "run" / "weights.npz").is_file()
@@ -620,6 +628,17 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
         odd = configured(tmp_path, data={"variation": {"height": 32, "width": 32, name: value}})
         with pytest.raises(ValueError, match=f"variation.{name} is {value}; this network takes multiples of 8"):
             run_flow_training(odd, tmp_path / "run")
+    for border, size, told in ((6, 32, "leaves 20 pixels"), (16, 32, "leaves 0 pixels")):
+        cut = {"loss": {"self_supervision": 0.3, "self_supervision_border_px": border}}
+        odd = configured(tmp_path, data={"variation": {"height": size, "width": size}}, **cut)
+        with pytest.raises(ValueError, match=f"{told} of data.variation.height.*set a multiple of 4"):
+            run_flow_training(odd, tmp_path / "run")
+    with pytest.raises(ConfigError, match="self_supervision_border_px is 0"):
+        configured(tmp_path, loss={"self_supervision_border_px": 0})
+    with pytest.raises(ConfigError, match="num_validation is 0; expected a multiple of 16, 16 or more"):
+        configured(tmp_path, data={"drawn": {"num_validation": 0}})
+    with pytest.raises(ConfigError, match="expected one of 'bfloat16'"):
+        configured(tmp_path, matmul_precision="bf16")
     with pytest.raises(ValueError, match="is no network that learns"):
         run_flow_training(configured(tmp_path, flow={"_target_": "tagjax.flow.opencv.DISFlow"}), tmp_path / "run")
 

@@ -53,6 +53,8 @@ class FlowLossSettings:
             raise ValueError(f"robustness is {self.robustness}; expected an exponent above 0 and at most 1.")
         if not 0 <= self.sequence_decay <= 1:
             raise ValueError(f"sequence_decay is {self.sequence_decay}; expected 0 (none) to 1.")
+        if self.self_supervision_border_px < 1:
+            raise ValueError(f"self_supervision_border_px is {self.self_supervision_border_px}; expected at least 1.")
         census_offsets(self.census_radius, self.census_stride)
 
 

@@ -16,10 +16,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ..config import TrainFlowConfig, build
-from ..data.picture_pairs import VariationSettings
+from ..data.picture_pairs import VariationSettings, open_sequence
 from ..evaluation.benchmark import machine
+from ..evaluation.flow_metrics import FlowScores
 from ..evaluation.report import write_json
-from ..flow.estimate import one_way
+from ..flow.estimate import NetworkFlow, one_way
+from ..flow.losses import FlowLossSettings
 from ..flow.named import make_flow
 from ..flow.network import AbstractFlowNetwork
 from ..flow.weights import load_weights, save_weights
@@ -35,6 +37,8 @@ from .step import make_optimizer
 
 _PEERS = ("zero", "dis_ultrafast", "dis_fast", "dis")
 _MOVING_PX = 0.5
+_WARPED_PAIRS = 8
+"""Of each sequence, spread over it."""
 
 
 def make_network(settings: Mapping[str, Any]) -> AbstractFlowNetwork:
@@ -45,10 +49,10 @@ def make_network(settings: Mapping[str, Any]) -> AbstractFlowNetwork:
     return network
 
 
-def initial_network(settings: Mapping[str, Any], init: str | None) -> AbstractFlowNetwork:
+def initial_network(settings: Mapping[str, Any], weights: str | None) -> AbstractFlowNetwork:
     """The network that the settings name, with the weights to begin with. Errors as of `make_network`, `load_weights`."""
     network = make_network(settings)
-    return network if init is None else load_weights(network, init)
+    return network if weights is None else load_weights(network, weights)
 
 
 def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console | None = None) -> float:
@@ -64,8 +68,8 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
 
 def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     begun = time.perf_counter()
-    network = initial_network(config.flow, config.init)
-    _check_sizes(network, config.data.variation)
+    network = initial_network(config.flow, config.weights)
+    _check_sizes(network, config.data.variation, config.loss)
     check_batch(config.loop.batch_size)
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
     state = FlowTrainState.create(network, optimizer, seed=config.seed)
@@ -104,9 +108,11 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     learned = local(trained.state.average)
     found = {"learned": scores(flow_of(learned, held_out), held_out), **peers}
     steps = int(trained.state.step)
+    warped = _warped(config, learned) if is_first() else {}
     summary = {
         "steps": steps,
         "epe_px": found,
+        **({"warped_levels": warped} if warped else {}),
         "steps_in_this_call": steps - first_step,
         "elapsed_s_in_this_call": round(time.perf_counter() - begun, 1),
         "machine": machine(),
@@ -122,19 +128,32 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     }
     save_weights(folder / "weights.npz", learned, about)
     console.print(_table(found))
+    if warped:
+        told = ", ".join(f"{name} {levels:.2f}" for name, levels in warped.items())
+        console.print(f"what is left of the sequences' pictures by warping, grey levels of 255: {told}")
     if trained.interrupted:
         console.print(f"Stopped at step {steps}; go on with hydra.run.dir={folder}")
         return float("nan")
     return found["learned"]["all"]
 
 
-def _check_sizes(network: AbstractFlowNetwork, variation: VariationSettings) -> None:
+def _check_sizes(network: AbstractFlowNetwork, variation: VariationSettings, loss: FlowLossSettings) -> None:
     for name in ("height", "width", "margin_px"):
         value = getattr(variation, name)
         if value % network.divisor:
             fitting = network.divisor * max(1, round(value / network.divisor))
             raise ValueError(
                 f"data.variation.{name} is {value}; this network takes multiples of {network.divisor}: set {fitting}."
+            )
+    if loss.self_supervision == 0:
+        return
+    border, half = loss.self_supervision_border_px, max(network.divisor // 2, 1)
+    for name in ("height", "width"):
+        left = getattr(variation, name) - 2 * border
+        if left < network.divisor or left % network.divisor:
+            raise ValueError(
+                f"loss.self_supervision_border_px is {border}, which leaves {left} pixels of data.variation.{name}; this "
+                f"network takes multiples of {network.divisor}, at least one: set a multiple of {half}, or a greater {name}."
             )
 
 
@@ -167,6 +186,28 @@ def scores(flow_px: np.ndarray, pairs: FlowPair) -> dict[str, float]:
     moving = np.linalg.norm(truth, axis=-1) > _MOVING_PX
     chosen = {"all": np.ones_like(hidden), "visible": ~hidden, "hidden": hidden, "moving": moving}
     return {name: float(np.mean(error[mask])) if mask.any() else float("nan") for name, mask in chosen.items()}
+
+
+def _warped(config: TrainFlowConfig, learned: AbstractFlowNetwork) -> dict[str, float]:
+    """Mean difference of pictures of the sequences when the next is warped onto them, grey levels; by network and peers.
+
+    The pictures were learned from as well, without a label. `before` are the weights that were begun with, if any were
+    given. Empty without sequences.
+    """
+    if not config.data.sequences:
+        return {}
+    flows = {"learned": NetworkFlow(learned), **{name: make_flow(name) for name in _PEERS}}
+    if config.weights is not None:
+        flows["before"] = NetworkFlow(initial_network(config.flow, config.weights))
+    total = dict.fromkeys(flows, FlowScores())
+    for path in config.data.sequences:
+        pictures = open_sequence(path, Path(config.data.drawn.folder))
+        for t in np.unique(np.linspace(0, pictures.shape[0] - 2, _WARPED_PAIRS).astype(int)):
+            first, second = np.asarray(pictures[t]), np.asarray(pictures[t + 1])
+            for name, flow in flows.items():
+                total[name] = total[name].merge(FlowScores.of_pictures(first, second, flow(first, second)))
+    told = {name: score.result()["warped_levels"] for name, score in total.items()}
+    return {name: float(levels) for name, levels in told.items() if levels is not None}
 
 
 def _table(found: Mapping[str, Mapping[str, float]]) -> Table:

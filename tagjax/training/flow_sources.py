@@ -50,9 +50,10 @@ class DrawnSettings:
     pairs: FlowPairSettings = dataclasses.field(default_factory=FlowPairSettings)
 
     def __post_init__(self) -> None:
-        for name in ("num_pairs", "num_validation"):
-            if getattr(self, name) % _BATCH:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected a multiple of {_BATCH}.")
+        for name, least in (("num_pairs", 0), ("num_validation", _BATCH)):
+            found = getattr(self, name)
+            if found % _BATCH or found < least:
+                raise ValueError(f"{name} is {found}; expected a multiple of {_BATCH}, {least} or more.")
 
 
 @dataclasses.dataclass(frozen=True)
