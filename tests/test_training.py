@@ -115,6 +115,10 @@ def test_reads_of_a_resting_tag_have_no_say() -> None:
     loss, numbers = eqx.filter_jit(contrast)(still, SETTINGS, KEY)
     assert float(loss) == pytest.approx(0.0, abs=1e-4)
     assert float(numbers["moving"]) == pytest.approx(0.0, abs=1e-5)
+    flips = np.random.default_rng(0).uniform(size=still.reads.phase_rad.shape) < 0.1
+    flipped = eqx.tree_at(lambda s: s.reads.phase_rad, still, still.reads.phase_rad + jnp.where(flips, jnp.pi, 0.0))
+    _, numbers = eqx.filter_jit(contrast)(flipped, SETTINGS, KEY)
+    assert float(numbers["moving"]) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_future_agreement_outlines_the_moving_object() -> None:

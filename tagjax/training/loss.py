@@ -35,7 +35,9 @@ class ObjectiveSettings:
     span_frames: int = 6  # coherence is taken over pieces this long: drift of the sum does not reach further
     skip_frames: int = 12  # at the start of a clip, while the tracer has not seen enough
     min_reads: int = 6  # a piece with fewer reads says nothing
-    rest_margin: float = 0.05  # a piece whose reads lose less coherence than this by taking the tag to rest is left out
+    rest_margin: float = (
+        0.05  # a piece whose reads, modulo pi, lose less coherence than this by taking the tag to rest is left out
+    )
     max_reads: int = 384  # reads of one tag in a clip
     num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
     multiple: int = 1  # of the coherence: 2 takes phases modulo pi: right whether the reader flips or not, but ambiguous twice as soon
@@ -186,7 +188,11 @@ def _agreement_of_antenna(
     inside = _pieces(frame_time_s, reads, settings)
 
     def score(
-        evidence: str, one: PhaseReads, member: Bool[Array, "piece reads"], step_m: Float[Array, " time"]
+        evidence: str,
+        one: PhaseReads,
+        member: Bool[Array, "piece reads"],
+        step_m: Float[Array, " time"],
+        multiple: int = settings.multiple,
     ) -> Array:
         residual = phase_residual(one.phase_rad, one.carrier_hz, distance_at(step_m, frame_time_s, one.time_s))
         weight = member.astype(residual.dtype) / (jnp.square(one.sigma_rad) + 0.1)[None]
@@ -195,7 +201,7 @@ def _agreement_of_antenna(
             return phase_likelihood(
                 residual, weight, channel, num_channels=settings.num_channels, flip_share=settings.flip_share
             )
-        return coherence(residual, weight, channel, num_channels=settings.num_channels, multiple=settings.multiple)
+        return coherence(residual, weight, channel, num_channels=settings.num_channels, multiple=multiple)
 
     # Shifts stay clear of 0 from both sides: motion is alike within a few frames.
     clear = min(3, num_frames // 4)
@@ -205,8 +211,9 @@ def _agreement_of_antenna(
     told, coherent = functools.partial(score, settings.evidence), functools.partial(score, "coherence")
     over_motions = jax.vmap(told, in_axes=(None, None, 0))
     rest = jnp.zeros(num_frames)
-    # Reads of a resting tag are coherent with no motion at all, but for their noise.
-    lost = 1.0 - jax.vmap(coherent, in_axes=(0, 0, None))(reads, inside, rest)
+    # Reads of a resting tag are coherent with no motion at all, but for their noise, and flips, which two angles undo.
+    modulo_pi = functools.partial(coherent, multiple=2)
+    lost = 1.0 - jax.vmap(modulo_pi, in_axes=(0, 0, None))(reads, inside, rest)
     weight = jnp.where(jnp.any(inside, axis=-1), jax.nn.relu(lost - settings.rest_margin), 0.0)
     return Agreement(
         between=jax.vmap(over_motions, in_axes=(0, 0, None))(reads, inside, steps),
