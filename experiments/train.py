@@ -17,6 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from .errors import in_a_line
+from .run_folder import keep_configuration
 
 CONFIGS = str(Path(__file__).resolve().parents[1] / "conf")
 
@@ -62,7 +63,7 @@ def main(config: DictConfig) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     with in_a_line("train", DivergedError):
         checked = from_mapping(TrainConfig, values)
-        OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+        keep_configuration(folder, values)
         score = run_training(checked, folder)
     print(f"run folder: {folder}")
     return score

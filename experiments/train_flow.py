@@ -11,9 +11,10 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from .errors import in_a_line
+from .run_folder import keep_configuration
 from .train import CONFIGS, resolved
 
 
@@ -27,7 +28,7 @@ def main(config: DictConfig) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     with in_a_line("train_flow", DivergedError):
         checked = from_mapping(TrainFlowConfig, values)
-        OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
+        keep_configuration(folder, values)
         score = run_flow_training(checked, folder)
     print(f"run folder: {folder}")
     return score

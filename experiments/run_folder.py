@@ -1,0 +1,49 @@
+"""The configuration in a run's folder: what it was begun with is what it goes on with."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+_FREE = ("loop", "logger", "distributed", "resume", "scores", "baselines", "baseline_estimators", "matmul_precision")
+_FREE_ENDS = ("workers", "decay_steps")  # the latter follows loop.num_steps
+
+
+def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
+    """Write `config.yaml`, where the run is new or goes on as it was configured.
+
+    Length, logs, scores and processes may change when a run goes on. Raises `ValueError`, naming what differs, where
+    anything else does, and leaves the file as it was; also where the run may not go on, which the run itself refuses.
+    """
+    path = folder / "config.yaml"
+    begun = any(step.name.isdigit() for step in (folder / "checkpoints").glob("*"))
+    if begun and path.is_file():
+        if not values.get("resume", True):
+            return
+        before = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+        differ = _differences(before, dict(values))
+        if differ:
+            raise ValueError(
+                f"{folder} holds a run that was configured otherwise: {'; '.join(differ)}. Give the same settings to go on "
+                "with it, or another folder."
+            )
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    OmegaConf.save(OmegaConf.create(dict(values)), beside)
+    os.replace(beside, path)
+
+
+def _differences(before: Any, now: Any, where: str = "") -> list[str]:
+    if where in _FREE or where.rpartition(".")[2] in _FREE_ENDS:
+        return []
+    if isinstance(before, dict) and isinstance(now, dict):
+        names = [*now, *(name for name in before if name not in now)]
+        return [
+            text
+            for name in names
+            for text in _differences(before.get(name), now.get(name), f"{where}.{name}".lstrip("."))
+        ]
+    return [] if before == now else [f"{where} was {before!r} and is {now!r}"]

@@ -1,0 +1,47 @@
+"""A run goes on as it was configured, or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from experiments.run_folder import keep_configuration
+
+VALUES = {"seed": 0, "tracer": {"cell": 6}, "loop": {"num_steps": 4}, "optimizer": {"decay_steps": 4}, "resume": True}
+
+
+def _begun(folder: Path) -> Path:
+    keep_configuration(folder, VALUES)
+    (folder / "checkpoints" / "4").mkdir(parents=True)
+    return folder
+
+
+def test_length_may_change_and_the_file_says_so(tmp_path: Path) -> None:
+    longer = {**VALUES, "loop": {"num_steps": 9}, "optimizer": {"decay_steps": 9}}
+    keep_configuration(_begun(tmp_path), longer)
+    assert OmegaConf.load(tmp_path / "config.yaml") == longer
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["config.yaml"]
+
+
+def test_another_configuration_is_refused_by_name_and_changes_nothing(tmp_path: Path) -> None:
+    for other, told in (
+        ({**VALUES, "seed": 3}, "seed was 0 and is 3"),
+        ({**VALUES, "tracer": {"cell": 8}}, "tracer.cell was 6 and is 8"),
+        ({**VALUES, "joint": {"weight": 1.0}}, "joint was None and is"),
+    ):
+        with pytest.raises(ValueError, match=f"configured otherwise: {told}"):
+            keep_configuration(_begun(tmp_path) if not list(tmp_path.iterdir()) else tmp_path, other)
+        assert OmegaConf.load(tmp_path / "config.yaml") == VALUES
+
+
+def test_what_may_not_go_on_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    keep_configuration(_begun(tmp_path), {**VALUES, "resume": False, "seed": 5})
+    assert OmegaConf.load(tmp_path / "config.yaml") == VALUES
+
+
+def test_a_folder_without_a_checkpoint_is_begun_anew(tmp_path: Path) -> None:
+    keep_configuration(tmp_path, VALUES)
+    keep_configuration(tmp_path, {**VALUES, "seed": 5})
+    assert OmegaConf.load(tmp_path / "config.yaml").seed == 5
