@@ -170,16 +170,25 @@ class EvaluateConfig:
     epcs: tuple[str, ...] | None = None
     stride: int | None = None
     frames: tuple[int, int] | None = None
-    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ClipSettings`
     baselines: Mapping[str, Mapping[str, Any]] | None = None
     baseline_estimators: Mapping[str, str] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
-    scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ScoreSettings`
     progress: bool = True
 
     def __post_init__(self) -> None:
         if self.stride is not None:
             check_clip(stride=self.stride)
+        changed(ClipSettings(), self.clips, where="clips")
+        changed(ScoreSettings(), self.scores, where="scores")
+        for name, other in (("tracer", self.tracer), ("weights", self.weights)):
+            if self.run is not None and other is not None:
+                raise ConfigError(f"run={self.run} has a tracer and parameters of its own: leave out {name}=, or run=.")
+        if self.run is None and self.checkpoint is not None:
+            raise ConfigError(
+                f"checkpoint={self.checkpoint} is one of a run's: give run=<folder of experiments.train>."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,6 +226,12 @@ def from_mapping(schema: type[T], values: Mapping[str, Any], *, where: str = "")
         raise ConfigError(f"{where or schema.__name__}: {error}.") from error
     except ValueError as error:
         raise ConfigError(f"{where or schema.__name__}: {error}") from error
+
+
+def changed(settings: T, values: Mapping[str, Any], *, where: str) -> T:
+    """The settings with those values that are not None in their places. Errors as of `from_mapping`."""
+    given = {name: value for name, value in values.items() if value is not None}
+    return from_mapping(type(settings), {**vars(settings), **given}, where=where)
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:

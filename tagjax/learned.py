@@ -5,6 +5,8 @@ Nothing in a file is executed: it names numbers, which take the place of paramet
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import json
 import math
 import os
@@ -52,15 +54,29 @@ def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[
     """The tracer with learned parameters in place of its own.
 
     `source` is a file of `save_parameters`, the name of packaged parameters, or `default`: those that were learned from
-    these very `settings`. Raises `ValueError` where there are none, or for a file that is damaged, foreign, or of
-    another tracer.
+    these very `settings`. Raises `ValueError` where there are none, for a file that is damaged, foreign, or of
+    another tracer, and where `settings` ask for other initial values than it was learned from.
     """
     path = _default_for(settings) if str(source) == "default" else _find(source)
     content = _read(path)
+    for name, default in _learnable(tracer).items():
+        began, asked = (given.get(name, default) for given in (content["settings"], settings))
+        if asked != began:
+            raise ValueError(
+                f"{path}: learned from {name}={began!r}, and what was learned takes its place, but {name}={asked!r} is "
+                f"asked for: leave {name} as it was, or weights= out."
+            )
     try:
         return tracer.with_physical(content["parameters"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _learnable(tracer: TagAttention) -> dict[str, Any]:
+    """The arguments that a tracer learns, which are not static, with their defaults."""
+    static = {field.name for field in dataclasses.fields(tracer) if field.metadata.get("static", False)}
+    arguments = inspect.signature(type(tracer)).parameters.values()
+    return {argument.name: argument.default for argument in arguments if argument.name not in static}
 
 
 def _find(source: str | Path) -> Path:

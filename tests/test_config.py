@@ -11,7 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from tagjax import config
-from tagjax.config import ConfigError, DataSettings, EvaluateConfig, TrainConfig, build, from_mapping
+from tagjax.config import ConfigError, DataSettings, EvaluateConfig, TrainConfig, build, changed, from_mapping
 from tagjax.evaluation.evaluate import ScoreSettings
 from tagjax.training.loop import LoopSettings
 from tagjax.training.loss import ObjectiveSettings
@@ -131,7 +131,10 @@ def test_defaults_in_code_are_those_of_the_files(path: str, section: str | None,
 
 def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
     values = _written("evaluate.yaml")
-    assert from_mapping(EvaluateConfig, values) == EvaluateConfig()
+    assert from_mapping(EvaluateConfig, {**values, "clips": {}, "scores": {}}) == EvaluateConfig()
+    for name, settings in (("clips", config.ClipSettings()), ("scores", ScoreSettings())):
+        assert changed(settings, values[name], where=name) == settings
+    assert set(values["scores"]) == {field.name for field in dataclasses.fields(ScoreSettings)}
     # A training clip's length, tags and workers mean nothing to an evaluation, which has its own epcs.
     assert set(values["clips"]) == {field.name for field in dataclasses.fields(config.ClipSettings)} - {
         "length",

@@ -52,6 +52,15 @@ def test_default_is_what_was_learned_from_these_settings(tmp_path: Path, monkeyp
         load_parameters(tracer, "default", {**SETTINGS, "cell": 9})
 
 
+def test_settings_that_learned_parameters_replace_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "one.json"
+    save_parameters(path, _stirred(1), SETTINGS)
+    tracer = TagAttention(cell=4)
+    with pytest.raises(ValueError, match=r"learned from beta=0.8.* but beta=0.5 is asked for"):
+        load_parameters(tracer, path, {**SETTINGS, "beta": 0.5})
+    load_parameters(tracer, path, {**SETTINGS, "cell": 9, "rest_doubt": 0.2})  # which are not learned
+
+
 def _changed(path: Path, **changes: Any) -> Path:
     content = json.loads(path.read_text())
     content.update(changes)

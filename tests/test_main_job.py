@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, VirtualTagSe
 from tagjax.data.store import save_recording
 from tagjax.evaluation.run import run_evaluation
 from tagjax.recording import RecordingError, TagReads
+from tagjax.training import run as run_module
 from tagjax.training.run import run_training
 from tagjax.training.sources import join_reads, with_virtual_tags
 
@@ -67,16 +69,56 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
     changed = json.loads((tmp_path / "parameters.json").read_text())
     assert changed["learned"] != changed["untrained"]
 
-    config = from_mapping(EvaluateConfig, {"run": str(tmp_path), "recordings": recordings[1:], "progress": False})
-    again = run_evaluation(config, tmp_path / "again", run_values={**values, "scores": {}})
+    gone = {**values, "data": {**values["data"], "recordings": ["gone.zarr"]}, "weights": "gone.json"}
+    again = run_evaluation(
+        from_mapping(EvaluateConfig, {"run": str(tmp_path), "progress": False}), tmp_path / "again", run_values=gone
+    )
     assert set(again) == {"learned", "learnable"}
+    assert again["learned"]["all"] == pytest.approx(summary["learned"]["all"])
     part = from_mapping(
-        EvaluateConfig, {"run": str(tmp_path), "frames": [0, 9], "baselines": {}, "stride": 8, "progress": False}
+        EvaluateConfig,
+        {
+            "run": str(tmp_path),
+            "recordings": recordings[1:],
+            "frames": [0, 9],
+            "baselines": {},
+            "clips": {"stride": 8},
+            "scores": {"moved_for_s": 0.0},
+            "progress": False,
+        },
     )
     held_out = run_evaluation(part, tmp_path / "part", run_values=values)
     assert set(held_out) == {"learned"}
     with (tmp_path / "part" / "frames.csv").open() as file:
         assert len(file.readlines()) == 1 + 2 * 9
+
+
+def test_what_a_run_says_of_itself_is_not_given_again() -> None:
+    for more in ({"tracer": {"_target_": "tagjax.tagattention.TagAttention"}}, {"weights": "default"}):
+        with pytest.raises(ConfigError, match="has a tracer and parameters of its own: leave out"):
+            from_mapping(EvaluateConfig, {"run": "runs/1", **more})
+    with pytest.raises(ConfigError, match="checkpoint=3 is one of a run's"):
+        from_mapping(EvaluateConfig, {"checkpoint": 3})
+    with pytest.raises(ConfigError, match="clips: unknown key 'strid'"):
+        from_mapping(EvaluateConfig, {"clips": {"strid": 3}})
+
+
+def test_processes_join_before_anything_asks_for_devices(
+    recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Joined(Exception):  # noqa: N818
+        pass
+
+    def joins(settings: Any) -> Any:
+        raise Joined
+
+    def too_early(*_: Any) -> Any:
+        raise AssertionError("built before the processes have joined")
+
+    monkeypatch.setattr(run_module, "joined", joins)
+    monkeypatch.setattr(run_module, "make_tracer", too_early)
+    with pytest.raises(Joined):
+        run_training(from_mapping(TrainConfig, _values(recordings)), tmp_path)
 
 
 def test_smoothing_that_the_tracer_cannot_do_is_refused_before_the_work(recordings: list[str], tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
         told = ", ".join(f"{name} {levels:.2f}" for name, levels in warped.items())
         console.print(f"what is left of the sequences' pictures by warping, grey levels of 255: {told}")
     if trained.interrupted:
-        console.print(f"Stopped at step {steps}; go on with hydra.run.dir={folder}")
+        console.print(f"Stopped at step {steps}; go on with the same command and hydra.run.dir={folder}")
         return float("nan")
     return found["learned"]["all"]
 

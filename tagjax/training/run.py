@@ -84,8 +84,8 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     several processes (`config.distributed`) the first writes and evaluates; the others return NaN.
     """
     console = console or Console()
-    smoothed({"learned": make_tracer(config.tracer)}, config.scores)
-    with joined(config.distributed):
+    with joined(config.distributed):  # before anything asks JAX for its devices
+        smoothed({"learned": make_tracer(config.tracer)}, config.scores)
         console.quiet = console.quiet or not is_first()
         training, validation = training_recordings(config.data)
         _describe(console, training, validation)
@@ -95,7 +95,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
         if not first:
             return float("nan")
         if trained.interrupted:
-            console.print(f"Stopped at step {int(trained.state.step)}; go on with hydra.run.dir={folder}")
+            console.print(f"Stopped at step {int(trained.state.step)}; go on with the same command and hydra.run.dir={folder}")
             return float("nan")
         if not validation:
             console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
@@ -109,7 +109,9 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     iou = found["all"].get("iou")
     if iou is not None:
         return float(iou)
-    return held_out_numbers(trained.state, held_out_clips(config, validation), config)["own_coherence"]
+    return held_out_numbers(trained.state, held_out_clips(config, validation), config).get(
+        "own_coherence", float("nan")
+    )
 
 
 def _train(
@@ -169,13 +171,15 @@ def _train(
 
 
 def _report(config: TrainConfig, folder: Path, state: TrainState, validation: Sequence[Recording]) -> dict[str, Any]:
-    """Evaluate the learned tracer beside the untrained one and the baselines; the report's summary.
+    """Evaluate the learned tracer beside that before the first step and the baselines; the report's summary.
 
-    Where a flow network was learned with it, each of the two sees with its own, kept as flow.npz and flow_untrained.npz.
+    Where a flow network was learned with it, each of the two sees with its own, kept as flow.npz and
+    flow_untrained.npz (flow_initial.npz, where it began from learned parameters).
     The learned parameters are kept as weights.json.
     """
-    models = {"learned": state.model, "untrained": make_model(config)}
-    files = {"learned": folder / "flow.npz", "untrained": folder / "flow_untrained.npz"}
+    before = "untrained" if config.weights is None else "initial"
+    models = {"learned": state.model, before: make_model(config)}
+    files = {"learned": folder / "flow.npz", before: folder / f"flow_{before}.npz"}
     flows = {name: own_flow(model, config, files[name]) for name, model in models.items()}
     tracers = {name: model.tracer if isinstance(model, JointModel) else model for name, model in models.items()}
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
