@@ -22,14 +22,18 @@ from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
 from tagjax.training.loop import DivergedError, LoopSettings, resumed, train
 from tagjax.training.loss import (
+    TERMS,
     ObjectiveSettings,
     agreement,
+    area,
     clip_reads,
+    compactness,
     contrast,
     distance_at,
     future_agreement,
     objective,
     see,
+    steadiness,
 )
 from tagjax.training.state import TrainState
 from tagjax.training.step import clip_gradient, clip_loss, make_optimizer, train_step
@@ -132,6 +136,50 @@ def test_future_agreement_outlines_the_moving_object() -> None:
         mean = np.asarray(agrees[:, tag])[told].mean(axis=0)
         assert mean[labels == label].min() > 0.95
         assert mean[labels == 0].max() < 1e-5
+
+
+def _masked(clip: synthetic.SyntheticClip, mask: np.ndarray):
+    seen = see(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
+    height, width = clip.frames.depth_m.shape[1:]
+    whole = np.broadcast_to(mask, (clip.frames.depth_m.shape[0], seen.said.mask.shape[1], height, width))
+    return eqx.tree_at(lambda s: s.said.mask, seen, jnp.asarray(whole, jnp.float32))
+
+
+def test_priors_have_their_closed_forms() -> None:
+    clip = _clip(8)
+    height, width = clip.frames.depth_m.shape[1:]
+    two = np.zeros((height, width))
+    two[3, 4] = two[9, 4] = 1.0
+    seen = _masked(clip, two)
+    assert float(area(seen, SETTINGS, KEY)[0]) == pytest.approx(2 / (height * width))
+    points = np.asarray(clip.camera.rays)[None] * np.asarray(clip.frames.depth_m)[..., None]
+    apart = np.sum((points[:, 3, 4] - points[:, 9, 4]) ** 2, axis=-1)  # each lies half of it from the middle
+    started = min(SETTINGS.skip_frames, len(apart) - 1)
+    assert float(compactness(seen, SETTINGS, KEY)[0]) == pytest.approx(np.mean(apart[started:]) / 4, rel=1e-4)
+    # A mask that goes along with the flow is steady; the same one that stays while the picture moves is not.
+    shift = jnp.broadcast_to(jnp.array([-1.0, 0.0]), clip.frames.backward_px.shape)
+    moving = np.stack([np.roll(two, t, axis=1) for t in range(8)])[:, None]
+    for mask, expected in ((moving, 0.0), (two, 1.0 - 1.0 / 5.0)):
+        along = eqx.tree_at(lambda s: s.frames.backward_px, _masked(clip, mask), shift)
+        assert float(steadiness(along, SETTINGS, KEY)[0]) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["area", "compactness", "steadiness"])
+def test_priors_have_the_gradient_of_their_masks(gradients_agree, name: str) -> None:
+    clip = synthetic.load(synthetic.recording(40), 5, 9)
+    settings = dataclasses.replace(SETTINGS, skip_frames=1)
+    seen = _masked(clip, np.random.default_rng(0).uniform(size=clip.frames.depth_m.shape[1:]))
+
+    def loss(share):
+        grown = jax.tree.map(
+            lambda leaf: leaf.astype(share.dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, seen
+        )
+        scaled = eqx.tree_at(lambda s: s.said.mask, grown, grown.said.mask ** (1.0 + share[0]))
+        return TERMS[name](scaled, settings, KEY)[0]
+
+    gradients_agree(jax.jit(loss), (np.array([0.3]),), atol=1e-6)
+    empty = jax.grad(lambda m: TERMS[name](eqx.tree_at(lambda s: s.said.mask, seen, m), settings, KEY)[0])
+    assert bool(jnp.isfinite(empty(jnp.zeros_like(seen.said.mask))).all())
 
 
 def test_a_clip_without_reads_or_depth_gives_finite_gradients() -> None:

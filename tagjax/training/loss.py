@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics import safe_divide
+from ..image.warp import gather
 from ..rf.coherence import coherence, phase_likelihood, phase_residual
 from ..rf.reads import PhaseReads
 from ..tracer import AbstractTracer, Camera, Frame, Trace, trace
@@ -28,6 +29,9 @@ class ObjectiveSettings:
 
     contrast: float = 1.0
     coverage: float = 0.3
+    area: float = 0.0  # weak priors, which know nothing of the tag: of the mask's share of the picture,
+    compactness: float = 0.0  # of its spread in 3D, m^2,
+    steadiness: float = 0.0  # and of what changes of it along the flow
     evidence: Literal["coherence", "likelihood"] = "coherence"  # of the contrast
     temperature: float = 0.1  # of the contrast, in units of coherence; of the likelihood in nats
     flip_share: float = 0.05  # of the likelihood: reads that are off by pi
@@ -323,9 +327,58 @@ def future_agreement(
     return jax.lax.stop_gradient((jnp.where(valid[:, None], beyond, 0.0), valid, weight))
 
 
+def area(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Mean share of the picture that the soft masks cover: of masks that explain the reads alike the smaller one."""
+    del key
+    mask = _started(seen.said.mask, settings)
+    return jnp.mean(mask), {}
+
+
+def compactness(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Mean square distance of the mask's points from their centre, m^2; masks of nothing have none."""
+    del key
+    depth = _started(seen.frames.depth_m, settings)
+    points = seen.camera.rays[None] * depth[..., None]
+    mask = jnp.where((depth > 0)[:, None], _started(seen.said.mask, settings), 0.0)
+    mass = jnp.sum(mask, axis=(-2, -1))
+    centre = safe_divide(
+        jnp.einsum("tkhw,thwc->tkc", mask, points), jnp.broadcast_to(mass[..., None], (*mass.shape, 3))
+    )
+    away = jnp.sum(jnp.square(points[:, None] - centre[:, :, None, None]), axis=-1)
+    return jnp.mean(safe_divide(jnp.sum(mask * away, axis=(-2, -1)), mass)), {}
+
+
+def steadiness(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """1 - Dice of each mask with that of the frame before, carried along the flow: an object does not come and go.
+
+    Pixels whose past lies outside the picture are left out.
+    """
+    del key
+    mask, backward = _started(seen.said.mask, settings), _started(seen.frames.backward_px, settings)
+    if mask.shape[0] < 2:
+        return jnp.zeros(()), {}
+    carry = lambda before, flow: gather(jnp.moveaxis(before, 0, -1), flow)  # noqa: E731
+    carried, known = jax.vmap(carry)(mask[:-1], backward[1:])
+    before, now = jnp.moveaxis(carried, -1, 1), jnp.where(known[:, None], mask[1:], 0.0)
+    overlap = jnp.sum(before * now, axis=(-2, -1))
+    size = jnp.sum(jnp.square(before), axis=(-2, -1)) + jnp.sum(jnp.square(now), axis=(-2, -1))
+    return jnp.mean(1.0 - (2.0 * overlap + 1.0) / (size + 1.0)), {}  # two masks of nothing agree
+
+
+def _started(each: Float[Array, time * shape], settings: ObjectiveSettings) -> Float[Array, started * shape]:
+    """What is said of the frames after the first ones, in which the tracer has not seen enough; of one at the least."""
+    return each[min(settings.skip_frames, each.shape[0] - 1) :]
+
+
 Term = Callable[[Seen, ObjectiveSettings, Array], tuple[Float[Array, ""], dict[str, Array]]]
 
-TERMS: Mapping[str, Term] = {"contrast": contrast, "coverage": coverage}
+TERMS: Mapping[str, Term] = {
+    "contrast": contrast,
+    "coverage": coverage,
+    "area": area,
+    "compactness": compactness,
+    "steadiness": steadiness,
+}
 """The terms of the objective by name; `ObjectiveSettings` has a weight of each name."""
 
 

@@ -95,7 +95,9 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
         if not first:
             return float("nan")
         if trained.interrupted:
-            console.print(f"Stopped at step {int(trained.state.step)}; go on with the same command and hydra.run.dir={folder}")
+            console.print(
+                f"Stopped at step {int(trained.state.step)}; go on with the same command and hydra.run.dir={folder}"
+            )
             return float("nan")
         if not validation:
             console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
