@@ -24,14 +24,15 @@ import yaml
 from hydra import compose, initialize_config_dir
 from jaxtyping import Array, Float
 
-import tagjax.flow.estimate
+import tagjax.flow
+import tagjax.flow.estimates
 import tagjax.flow.weights
 from tagjax.arrays_file import named_arrays
 from tagjax.config import build
 from tagjax.data.clips import load_clip
 from tagjax.data.flow_cache import pair_flow
 from tagjax.data.store import open_recording, save_recording
-from tagjax.flow.estimate import NetworkFlow, agreement, estimate, one_way, padding
+from tagjax.flow.estimates import NetworkFlow, agreement, estimate, one_way, padding
 from tagjax.flow.losses import occluded
 from tagjax.flow.named import CLASSICAL, VARIANTS, flow_along, flow_key, make_flow
 from tagjax.flow.network import AbstractFlowNetwork
@@ -49,6 +50,12 @@ SETTINGS = {
     "decoder_widths": [[8], [8]],
 }
 TRACED: list[tuple[int, ...]] = []
+
+
+def _pictures(count: int, height: int, width: int) -> list[np.ndarray]:
+    """One smooth picture, shifted by a pixel more each time."""
+    smooth = cv2.GaussianBlur(np.random.default_rng(7).integers(0, 256, (height, width, 3), np.uint8), (0, 0), 2)
+    return [np.roll(smooth, number, axis=1) for number in range(count)]
 
 
 class Painted(AbstractFlowNetwork):
@@ -288,9 +295,9 @@ def test_a_failure_in_the_second_thread_is_told(monkeypatch):
             raise FloatingPointError("told")
         return picture
 
-    monkeypatch.setattr(tagjax.flow.estimate, "_encode", failing)
-    key = next(key for key in tagjax.flow.estimate._compiled if key[2][-1] == ((64, 64, 3), jnp.uint8))
-    tagjax.flow.estimate._compiled.add((failing, *key[1:]))
+    monkeypatch.setattr(tagjax.flow.estimates, "_encode", failing)
+    key = next(key for key in tagjax.flow.estimates._compiled if key[2][-1] == ((64, 64, 3), jnp.uint8))
+    tagjax.flow.estimates._compiled.add((failing, *key[1:]))
     with pytest.raises(FloatingPointError, match="told"):
         estimate(network, *pictures)
 
@@ -299,8 +306,8 @@ def test_a_video_is_encoded_once_and_flows_both_ways(monkeypatch):
     flow = NetworkFlow(small_network(gain=30.0))
     pictures = [texture(66, 70, n) for n in range(4)]
     direct = [(flow(a, b), flow(b, a)) for a, b in itertools.pairwise(pictures)]
-    encode, seen = tagjax.flow.estimate._encode, []
-    monkeypatch.setattr(tagjax.flow.estimate, "_encode", lambda *args: (seen.append(1), encode(*args))[1])
+    encode, seen = tagjax.flow.estimates._encode, []
+    monkeypatch.setattr(tagjax.flow.estimates, "_encode", lambda *args: (seen.append(1), encode(*args))[1])
     for found, expected in zip(flow_along(flow, pictures), direct, strict=True):
         for one, other in zip(found, expected, strict=True):
             np.testing.assert_allclose(one, other, atol=1e-5)
@@ -449,7 +456,7 @@ def test_settings_of_a_file_name_nothing_but_networks(tmp_path):
     for target in (
         "os.system",
         "tagjax.flow.pyramid._Decoder",
-        "tagjax.flow.estimate.NetworkFlow",
+        "tagjax.flow.estimates.NetworkFlow",
         "tagjax.flow.weights.Path",
         "tagjax.flow.network.AbstractFlowNetwork",
         "tagjax.flow.none.PyramidFlow",
@@ -614,3 +621,70 @@ def test_the_packaged_fast_flow_sees_a_picture_move():
     pictures = texture(96, 128), np.roll(texture(96, 128), (1, 3), axis=(0, 1))
     error_px = np.linalg.norm(make_flow("pyramid_fast")(*pictures)[16:-16, 16:-16] - [3, 1], axis=-1)
     assert error_px.mean() < 0.5
+
+
+@pytest.mark.parametrize("name", ["zero", "dis_ultrafast", "pyramid", "pyramid_fast", "pyramid_mid", "pyramid+rest"])
+def test_equal_pictures_have_no_flow_whatever_they_show(name: str) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (70, 90, 3), np.uint8)
+    flow = make_flow(name)
+    for picture in (np.full_like(noise, 128), cv2.GaussianBlur(noise, (0, 0), 6), noise):
+        found = estimate(flow, picture, picture.copy())
+        assert not np.asarray(found.forward_px).any()
+        assert not np.asarray(found.backward_px).any()
+        assert not found.forward_occluded.any()
+        assert float(found.backward_confidence.min()) == 1.0
+        assert not flow(picture, picture.copy()).any()
+        assert not any(way.any() for ways in flow_along(flow, [picture, picture.copy()]) for way in ways)
+
+
+def test_pictures_that_differ_keep_their_flow() -> None:
+    """Equal but for one small thing that moves on a flat ground."""
+    ground = np.full((96, 128, 3), 90, np.uint8)
+    first, second = ground.copy(), ground.copy()
+    thing = np.random.default_rng(1).integers(0, 256, (16, 16, 3), np.uint8)
+    first[40:56, 50:66], second[40:56, 54:70] = thing, thing
+    found = estimate(make_flow("pyramid_mid"), first, second)
+    assert float(found.forward_px[48, 58, 0]) == pytest.approx(4.0, abs=1.0)
+
+
+@pytest.mark.parametrize("name", ["dis", "pyramid_fast", "pyramid_fast+rest"])
+def test_any_flow_by_name_comes_with_what_is_hidden(name: str) -> None:
+    first, second = _pictures(2, 64, 96)  # which need no padding
+    flow = make_flow(name)
+    found = estimate(flow, first, second)
+    np.testing.assert_allclose(found.forward_px, flow(first, second), atol=1e-4)
+    np.testing.assert_allclose(found.backward_px, flow(second, first), atol=1e-4)
+    whole = agreement(found.forward_px, found.backward_px)
+    np.testing.assert_allclose(found.forward_confidence, whole, atol=1e-5)
+    np.testing.assert_array_equal(found.forward_occluded, np.asarray(whole) <= 0.5)
+
+
+def test_networks_without_weights_and_variants_of_a_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"'raft_small' comes without weights.*flow=raft_small"):
+        make_flow("raft_small")
+    mine = tmp_path / "mine.npz"
+    mine.write_bytes((tagjax.flow.weights.PACKAGED / "pyramid.npz").read_bytes())
+    assert flow_key(f"pyramid_fine:{mine}") == flow_key("pyramid_fine") != flow_key(f"pyramid_mid:{mine}+rest")
+    first, second = _pictures(2, 70, 80)
+    np.testing.assert_array_equal(
+        make_flow(f"pyramid_mid:{mine}")(first, second), make_flow("pyramid_mid")(first, second)
+    )
+    with pytest.raises(ValueError, match=r"No weights at 'none\.npz'"):
+        make_flow("pyramid_mid:none.npz")
+
+
+def test_the_package_gives_flows_by_name() -> None:
+    assert tagjax.flow.make_flow is make_flow
+    assert tagjax.flow.estimate is estimate
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        tagjax.flow.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_readmes_flow_of_two_pictures_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text().split("## Optical flow")[1]
+    code = text.split("```python\n")[1].split("```")[0]
+    for name, picture in zip(("a.png", "b.png"), _pictures(2, 70, 80), strict=True):
+        cv2.imwrite(str(tmp_path / name), picture)
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})

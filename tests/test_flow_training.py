@@ -27,7 +27,7 @@ from tagjax.data.picture_pairs import (
     pair_dataset,
     vary,
 )
-from tagjax.flow.estimate import NetworkFlow
+from tagjax.flow.estimates import NetworkFlow
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.named import make_flow
 from tagjax.flow.network import AbstractFlowNetwork

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import optax
 
-from ..flow.estimate import NetworkFlow
+from ..flow.estimates import NetworkFlow
 from ..flow.losses import FlowLossSettings
 from ..flow.named import flow_along, make_flow
 from ..flow.pyramid import PyramidFlow

@@ -1,1 +1,19 @@
 """Optical flow: networks, losses, estimates, weights, and named flows. `opencv` and `named` import cv2."""
+
+from typing import TYPE_CHECKING, Any
+
+from .estimates import FlowEstimate, estimate
+from .weights import load_network, packaged_weights, save_weights
+
+if TYPE_CHECKING:
+    from .named import flow_along, make_flow
+
+__all__ = ["FlowEstimate", "estimate", "flow_along", "load_network", "make_flow", "packaged_weights", "save_weights"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("flow_along", "make_flow"):
+        from . import named
+
+        return getattr(named, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

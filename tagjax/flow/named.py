@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from . import opencv
-from .estimate import NetworkFlow
+from .estimates import NetworkFlow
 from .opencv import FlowFunction
 from .pictures import check_pictures
 from .stillness import BLOCK_PX, GAIN, GENTLE_BLOCK_PX, GENTLE_GAIN, settled
@@ -50,7 +50,9 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "pyramid_mid": ("pyramid", {"octaves": (-1, 0, 1), "medians": 2}),
     "pyramid_fine": ("pyramid", {"octaves": (-1, 0, 1, 2), "medians": 2}),
 }
-"""Packaged weights with other settings of their network, by name."""
+"""Packaged weights with other settings of their network, by name; `<name>:<weights.npz>` has a file's weights in their place."""
+
+_UNTRAINED = ("flownet_s", "flownet_c", "raft_small")
 
 AT_REST = "+rest"
 """What the name of a flow ends with that is to be `SettledFlow`'s."""
@@ -64,7 +66,7 @@ def taken_apart(name: str) -> tuple[str, str]:
 def make_flow(name: str) -> FlowFunction:
     """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
 
-    With `AT_REST` after it, the same as `SettledFlow`. Raises `ValueError` for a name that is none of these, and for weights
+    `pyramid_fine:<weights.npz>` is a variant with the weights of a file, such as fine-tuned ones. With `AT_REST` after it, the same as `SettledFlow`. Raises `ValueError` for a name that is none of these, and for weights
     that cannot be used.
     """
     name, rest = taken_apart(name)
@@ -88,10 +90,11 @@ def flow_key(name: str) -> str:
         return name
     path = _weights(name)
     key = _weights_key(str(path), _stamp(path))
-    if name not in VARIANTS:
+    variant, _ = _variant(name)
+    if variant is None:
         return key
-    changes = hashlib.sha256(repr(sorted(VARIANTS[name][1].items())).encode()).hexdigest()
-    return f"{key}-{name}-{changes[:8]}"
+    changes = hashlib.sha256(repr(sorted(VARIANTS[variant][1].items())).encode()).hexdigest()
+    return f"{key}-{variant}-{changes[:8]}"
 
 
 def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -121,15 +124,27 @@ def settled_along(
         )
 
 
+def _variant(name: str) -> tuple[str | None, str]:
+    """The variant that a name is, if any, and whose weights it has: packaged ones, or a file's."""
+    variant, _, source = name.partition(":")
+    if variant not in VARIANTS:
+        return None, name
+    return variant, source or VARIANTS[variant][0]
+
+
 def _weights(name: str) -> Path:
-    if name in VARIANTS:
-        return find_weights(VARIANTS[name][0])
-    if name.endswith(".npz") or name in packaged_weights():
-        return find_weights(name)
+    variant, source = _variant(name)
+    if variant is not None or source.endswith(".npz") or source in packaged_weights():
+        return find_weights(source)
     there = ", ".join(packaged_weights()) or "none"
+    if name in _UNTRAINED:
+        raise ValueError(
+            f"The network {name!r} comes without weights (there are: {there}). Train it, `python -m experiments.train_flow "
+            f"flow={name}`, and give <run>/weights.npz as the flow."
+        )
     raise ValueError(
         f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({there}), "
-        f"or the path of an .npz file of weights; {AT_REST} may follow."
+        f"the path of an .npz file of weights, or <variant>:<path>; {AT_REST} may follow."
     )
 
 
@@ -141,8 +156,8 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 @functools.lru_cache(maxsize=4)
 def _network_flow(name: str, path: str, stamp: tuple[int, int]) -> NetworkFlow:
-    changes = VARIANTS[name][1] if name in VARIANTS else {}
-    return NetworkFlow(load_network(path, **changes))
+    variant, _ = _variant(name)
+    return NetworkFlow(load_network(path, **({} if variant is None else VARIANTS[variant][1])))
 
 
 @functools.lru_cache(maxsize=64)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 class AbstractFlowNetwork(eqx.Module):
     """A flow network in two parts, so that a video's pictures are encoded once and both directions share them.
 
-    Pictures are RGB, 0 to 1, with sides that are multiples of `divisor` (`tagjax.flow.estimate` takes any size).
+    Pictures are RGB, 0 to 1, with sides that are multiples of `divisor` (`tagjax.flow.estimates` takes any size).
     """
 
     divisor: eqx.AbstractVar[int]

@@ -20,7 +20,7 @@ from ..data.picture_pairs import VariationSettings, open_sequence
 from ..evaluation.benchmark import machine
 from ..evaluation.flow_metrics import FlowScores
 from ..evaluation.report import write_json
-from ..flow.estimate import NetworkFlow, one_way
+from ..flow.estimates import NetworkFlow, one_way
 from ..flow.losses import FlowLossSettings
 from ..flow.named import make_flow
 from ..flow.network import AbstractFlowNetwork

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
-from ..flow.estimate import padding
+from ..flow.estimates import padding
 from ..flow.losses import FlowLossSettings, weighted
 from ..flow.network import AbstractFlowNetwork, flow_both_ways
 from ..flow.stillness import has_moved

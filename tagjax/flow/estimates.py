@@ -1,4 +1,4 @@
-"""Flow of two pictures of any size by a network: padding, both directions, what is hidden, and how sure it is.
+"""Flow of two pictures of any size: padding, both directions, what is hidden, and how sure it is.
 
 The network runs compiled, once for every padded size; sizes are rounded up to its divisor, so that they share code.
 """
@@ -27,6 +27,9 @@ SHARE, FLOOR_PX2 = 0.01, 0.5
 _SMALLEST = 64
 """Pixels of a side that every network's roughest level can do with."""
 
+_ROUNDING = 1.01 / 255
+"""Pictures that nowhere differ by more show the same: any motion would be a guess."""
+
 _second_thread = ThreadPoolExecutor(1, "tagjax-flow")
 _compiled: set[Any] = set()
 
@@ -40,6 +43,10 @@ class FlowEstimate(eqx.Module):
     backward_occluded: Bool[Array, "height width"]
     forward_confidence: Float[Array, "height width"]
     backward_confidence: Float[Array, "height width"]
+
+
+HostFlow = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Pictures on the host to flow on the host: a `FlowFunction` (`tagjax.flow.opencv`)."""
 
 
 def agreement(
@@ -85,6 +92,13 @@ def _unit(picture: Array) -> Array:
     return picture.astype(jnp.float32) / 255 if picture.dtype == jnp.uint8 else picture
 
 
+@jax.jit
+def _still(flow_px: Array, first: Array, second: Array) -> Array:
+    """The flow, or none where the two pictures are the same one: a still scene has none, however it looks."""
+    same = jnp.max(jnp.abs(_unit(first) - _unit(second))) <= _ROUNDING
+    return jnp.where(same, 0.0, flow_px)
+
+
 @eqx.filter_jit
 def _encode(network: AbstractFlowNetwork, picture: Array) -> Any:
     return network.encode(_unit(picture))
@@ -92,7 +106,8 @@ def _encode(network: AbstractFlowNetwork, picture: Array) -> Any:
 
 @eqx.filter_jit
 def _forward(network: AbstractFlowNetwork, first: Array, second: Array) -> Array:
-    return network.decode(network.encode(_unit(first)), network.encode(_unit(second)))[-1]
+    flow_px = network.decode(network.encode(_unit(first)), network.encode(_unit(second)))[-1]
+    return _still(flow_px, first, second)
 
 
 @eqx.filter_jit
@@ -143,19 +158,25 @@ def _checked(first: Any, second: Any) -> tuple[Any, Any]:
     return (jnp.asarray(first), jnp.asarray(second)) if traced else check_pictures(first, second)
 
 
-def estimate(network: AbstractFlowNetwork, first: Any, second: Any) -> FlowEstimate:
-    """Flow between two pictures, both ways, with what is hidden and how sure it is.
+def estimate(flow: AbstractFlowNetwork | HostFlow, first: Any, second: Any) -> FlowEstimate:
+    """Flow between two pictures, both ways, with what is hidden and how sure it is; none between equal pictures.
 
-    Takes pictures as `check_pictures` does, whose errors it raises; within a transformation of JAX, floats (height,
-    width, 3) from 0 to 1. Sides that are too short, or no multiple of the network's divisor, are padded by repeating the
-    edge, and the flow is cut back.
+    `flow` is a network, or any flow by name (`make_flow`), which is asked once for each way. Takes pictures as
+    `check_pictures` does, whose errors it raises; of a network, within a transformation of JAX, floats (height, width, 3)
+    from 0 to 1. Sides that are too short, or no multiple of the network's divisor, are padded by repeating the edge, and the
+    flow is cut back.
     """
+    network = flow.network if isinstance(flow, NetworkFlow) else flow
     one, other = _checked(first, second)
+    if not isinstance(network, AbstractFlowNetwork):
+        height, width = one.shape[:2]
+        forward, backward = (jnp.asarray(network(*pair), jnp.float32) for pair in ((one, other), (other, one)))
+        return _judged(forward, backward, jnp.asarray([0, 0, width - 1, height - 1], jnp.int32))
     one, place, area = _padded(network, one)
     other, _, _ = _padded(network, other)
     features = _twice(_encode, network, (one,), (other,))
-    grown = _judged(*_both_ways(network, *features), jnp.asarray(area))
-    return jax.tree.map(lambda leaf: leaf[place], grown)
+    forward, backward = (_still(way, one, other) for way in _both_ways(network, *features))
+    return jax.tree.map(lambda leaf: leaf[place], _judged(forward, backward, jnp.asarray(area)))
 
 
 def _padded_flow(network: AbstractFlowNetwork, first: Any, second: Any) -> tuple[Array, tuple[slice, slice]]:
@@ -184,12 +205,12 @@ class NetworkFlow:
 
     def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Flow forward and backward between neighbouring pictures; each picture is encoded once."""
-        before, known = None, None
+        before, last, known = None, None, None
         for picture in pictures:
             checked, _ = check_pictures(picture, picture if before is None else before)
             grown, place, _ = _padded(self.network, checked)
             features = _encode(self.network, grown)
             if before is not None:
-                forward, backward = _both_ways(self.network, known, features)
+                forward, backward = (_still(way, last, grown) for way in _both_ways(self.network, known, features))
                 yield np.asarray(forward)[place], np.asarray(backward)[place]
-            before, known = picture, features
+            before, last, known = picture, grown, features
