@@ -77,6 +77,14 @@ def test_folder_of_pictures_is_read_in_order_of_names_as_rgb(tmp_path: Path) -> 
     np.testing.assert_array_equal(found[1], pictures[1])
 
 
+def test_numbers_in_names_of_pictures_count_by_their_value(tmp_path: Path) -> None:
+    names = ["frame1.png", "frame01b.png", "frame2.png", "frame9.png", "frame10.png", "frame10-2.png", "frame10-11.png"]
+    for level, name in enumerate(names):
+        cv2.imwrite(str(tmp_path / name), np.full((4, 4, 3), level, np.uint8))
+    found = ImageFolder(tmp_path)
+    assert [int(found[number][0, 0, 0]) for number in range(len(names))] == list(range(len(names)))
+
+
 def test_grey_and_16_bit_pictures_become_rgb_of_8_bits(tmp_path: Path) -> None:
     grey = np.arange(40 * 50, dtype=np.uint16).reshape(40, 50) * 32
     cv2.imwrite(str(tmp_path / "a.png"), grey)

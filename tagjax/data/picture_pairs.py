@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Sequence
@@ -73,10 +74,10 @@ class VariationSettings:
 
 
 class ImageFolder:
-    """The pictures of a folder in order of their names, read when asked for."""
+    """The pictures of a folder in order of their names (frame2 before frame10), read when asked for."""
 
     def __init__(self, folder: Path):
-        self._files = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
+        self._files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=_place)
         if len(self._files) < 2:
             raise RecordingError(
                 f"{folder} holds {len(self._files)} pictures ({', '.join(IMAGE_ENDINGS)}); a flow needs at least two."
@@ -92,6 +93,12 @@ class ImageFolder:
                 f"picture has {self.shape[2]} x {self.shape[1]}. Put pictures of one camera into one folder."
             )
         return picture
+
+
+def _place(path: Path) -> tuple[list[str | int], str]:
+    """Where a file comes in its folder: by its name, the numbers in it by their value."""
+    parts = re.split(r"([0-9]+)", path.stem)
+    return [int(part) if number % 2 else part for number, part in enumerate(parts)], path.name
 
 
 def _read_picture(path: Path) -> np.ndarray:
