@@ -145,6 +145,37 @@ def test_video_is_decoded_once_and_kept(tmp_path: Path) -> None:
     assert list(cache.iterdir()) == kept
 
 
+class StatedCapture:
+    """A video that says that it holds another number of frames than it does; streamed webm says -1.4e17."""
+
+    stated = 0.0
+    opened = cv2.VideoCapture
+
+    def __init__(self, path: str):
+        self._capture = self.opened(path)
+        self.read, self.release = self._capture.read, self._capture.release
+
+    def get(self, what: int) -> float:
+        return self.stated if what == cv2.CAP_PROP_FRAME_COUNT else self._capture.get(what)
+
+
+@pytest.mark.parametrize("stated", [-1.4e17, 0.0, 3.0, 900.0, float("inf"), float("nan")])
+def test_video_is_read_to_its_end_whatever_it_says_of_its_length(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: float
+) -> None:
+    write_video(tmp_path / "film.avi", smooth_pictures(5, 32, 48))
+    monkeypatch.setattr(StatedCapture, "stated", stated)
+    monkeypatch.setattr(cv2, "VideoCapture", StatedCapture)
+    assert open_sequence(str(tmp_path / "film.avi"), tmp_path / "cache").shape[0] == 5
+
+
+def test_video_of_one_frame_is_refused_and_not_kept(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.avi", smooth_pictures(1, 32, 48))
+    with pytest.raises(RecordingError, match=r"film\.avi holds 1 picture"):
+        open_sequence(str(tmp_path / "film.avi"), tmp_path / "cache")
+    assert not (tmp_path / "cache").exists() or not list((tmp_path / "cache").iterdir())
+
+
 def test_broken_video_says_so_and_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "film.mp4").write_bytes(b"no video at all")
     with pytest.raises(RecordingError, match="cannot be decoded"):

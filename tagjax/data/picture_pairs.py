@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import os
 import re
 import shutil
@@ -21,7 +22,7 @@ import grain
 import numpy as np
 import zarr
 from jaxtyping import Float, Float32, UInt8
-from rich.progress import track
+from rich.progress import Progress
 
 from .._types import LazyArray
 from ..recording import RecordingError
@@ -33,6 +34,9 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".web
 
 _LONGEST_SIDE = 640
 """Videos are kept no larger: crops for training are far smaller."""
+
+_DECODING = 2
+"""To be raised when the same video gives other frames: older copies are then not read."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +138,7 @@ def open_sequence(path: str, cache: Path) -> LazyArray:
 
 def _decoded(video: Path, cache: Path) -> LazyArray:
     """The frames of a video, from the cache if it was decoded before."""
-    stamp = f"{video.resolve()} {video.stat().st_size} {video.stat().st_mtime_ns}"
+    stamp = f"{_DECODING} {video.resolve()} {video.stat().st_size} {video.stat().st_mtime_ns}"
     target = cache / f"{video.stem}-{hashlib.sha256(stamp.encode()).hexdigest()[:12]}.zarr"
     if not target.exists():
         _decode(video, target)
@@ -142,6 +146,7 @@ def _decoded(video: Path, cache: Path) -> LazyArray:
 
 
 def _decode(video: Path, target: Path) -> None:
+    """Write the frames (frame, height, width, 3) of a video. Raises `RecordingError` for fewer than two."""
     capture = cv2.VideoCapture(str(video))
     try:
         ok, picture = capture.read()
@@ -149,17 +154,21 @@ def _decode(video: Path, target: Path) -> None:
             raise RecordingError(f"{video} cannot be decoded. Is it whole, and does OpenCV know its codec?")
         factor = min(1.0, _LONGEST_SIDE / max(picture.shape[:2]))
         size = (round(picture.shape[1] * factor), round(picture.shape[0] * factor))
-        counted = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        # Streamed videos say nothing, or nonsense: the bar alone believes it.
+        stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
         try:
             shape = (0, size[1], size[0], 3)
             kept = zarr.create_array(str(partial), shape=shape, dtype="uint8", chunks=(1, *shape[1:]))
-            for _ in track(range(max(counted, 1)), description=f"decode {video.name}", transient=True):
-                small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
-                kept.append(np.ascontiguousarray(small)[None])
-                ok, picture = capture.read()
-                if not ok:
-                    break
+            with Progress(transient=True) as bar:
+                task = bar.add_task(f"decode {video.name}", total=stated if 0 < stated < math.inf else None)
+                while ok:
+                    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
+                    kept.append(np.ascontiguousarray(small)[None])
+                    bar.advance(task)
+                    ok, picture = capture.read()
+            if kept.shape[0] < 2:
+                raise RecordingError(f"{video} holds {kept.shape[0]} picture that can be decoded; a flow needs two.")
             os.replace(partial, target)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
