@@ -108,8 +108,9 @@ def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
         cv2.imwrite(str(tmp_path / "b.png"), pictures[1][:30])
         told = "50 x 30 pixels"
     elif broken == "cut":
-        (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
-        told = "cannot be read as a picture"
+        for name in names:
+            (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:60])
+        told = r"none of 2 pictures can be read. First: .*a\.png: the picture is cut short"
     elif broken == "nothing":
         path, told = str(tmp_path / "nowhere"), "found nothing"
     else:
@@ -117,6 +118,33 @@ def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
         path, told = str(tmp_path / "x.txt"), "found a file"
     with pytest.raises(RecordingError, match=told):
         open_sequence(path, tmp_path / "cache")[1]
+
+
+def test_bad_pictures_of_a_folder_are_named_when_it_is_opened(tmp_path: Path) -> None:
+    pictures = smooth_pictures(20, 40, 50)
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(tmp_path / f"{number}.{'jpg' if number % 3 == 2 else 'png'}"), picture)
+    cv2.imwrite(str(tmp_path / "0.png"), pictures[0][:30])  # the first is no measure of the others
+    for name, share in (("9.png", 0.9), ("11.jpg", 0.9), ("19.png", 0.0)):
+        whole = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(RecordingError, match="4 of 20 pictures cannot be used; expected whole ones of 50 x 40") as told:
+        open_sequence(str(tmp_path), tmp_path / "cache")
+    for words in ("0.png: 50 x 30 pix", "9.png: the picture is cut", "11.jpg: the picture is cut", "19.png: no read"):
+        assert words in str(told.value)
+    for number in range(20):
+        cv2.imwrite(str(tmp_path / f"{number}.bmp"), pictures[0][:30])
+    with pytest.raises(RecordingError, match=r"of 50 x 30 .* And 14 more\."):
+        open_sequence(str(tmp_path), tmp_path / "cache")
+
+
+def test_a_picture_that_changes_after_opening_is_named(tmp_path: Path) -> None:
+    for number, picture in enumerate(smooth_pictures(2, 40, 50)):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
+    folder = ImageFolder(tmp_path)
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((30, 50, 3), np.uint8))
+    with pytest.raises(RecordingError, match=r"1\.png has 50 x 30 pixels by now; all had 50 x 40"):
+        folder[1]
 
 
 def write_video(path: Path, frames: np.ndarray) -> None:

@@ -13,7 +13,9 @@ import os
 import re
 import shutil
 import uuid
+from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,10 +24,11 @@ import grain
 import numpy as np
 import zarr
 from jaxtyping import Float, Float32, UInt8
-from rich.progress import Progress
+from rich.progress import Progress, track
 
 from .._types import LazyArray
 from ..recording import RecordingError
+from .picture_files import read_colour
 from .store import open_recording
 from .stream import Stream
 
@@ -37,6 +40,9 @@ _LONGEST_SIDE = 640
 
 _DECODING = 2
 """To be raised when the same video gives other frames: older copies are then not read."""
+
+_MANY_FILES, _NAMED_FILES = 200, 5
+"""A folder of so many pictures shows a bar while it is checked; so many of its bad ones are named."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +84,11 @@ class VariationSettings:
 
 
 class ImageFolder:
-    """The pictures of a folder in order of their names (frame2 before frame10), read when asked for."""
+    """The pictures of a folder in order of their names (frame2 before frame10) as RGB, read when asked for.
+
+    All are read once when the folder is opened: `RecordingError` names those that cannot be, and those of another size
+    than most.
+    """
 
     def __init__(self, folder: Path):
         self._files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=_place)
@@ -86,15 +96,17 @@ class ImageFolder:
             raise RecordingError(
                 f"{folder} holds {len(self._files)} pictures ({', '.join(IMAGE_ENDINGS)}); a flow needs at least two."
             )
-        self.shape = (len(self._files), *_read_picture(self._files[0]).shape)
+        self.shape = (len(self._files), *_common_shape(folder, self._files))
         self.dtype = np.dtype(np.uint8)
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        picture = _read_picture(self._files[int(index)])
+        """The picture, uint8 (height, width, 3); grey ones become RGB, 16 bits become 8."""
+        path = self._files[int(index)]
+        picture = np.ascontiguousarray(read_colour(path))
         if picture.shape != self.shape[1:]:
             raise RecordingError(
-                f"{self._files[int(index)]} has {picture.shape[1]} x {picture.shape[0]} pixels; the folder's first "
-                f"picture has {self.shape[2]} x {self.shape[1]}. Put pictures of one camera into one folder."
+                f"{path} has {_size(picture.shape)} pixels by now; all had {_size(self.shape[1:])} when the folder was "
+                "opened. Leave it as it is during a run."
             )
         return picture
 
@@ -105,12 +117,42 @@ def _place(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if number % 2 else part for number, part in enumerate(parts)], path.name
 
 
-def _read_picture(path: Path) -> np.ndarray:
-    """RGB uint8; grey pictures become RGB, 16 bits become 8."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise RecordingError(f"{path} cannot be read as a picture. Is it whole, and is its ending right?")
-    return np.ascontiguousarray(picture[..., ::-1])
+def _common_shape(folder: Path, files: Sequence[Path]) -> tuple[int, ...]:
+    """The shape (height, width, 3) of all pictures. Raises `RecordingError` that names those which differ from most."""
+    shapes, bad = {}, {}
+    with ThreadPoolExecutor() as pool:
+        # Decoding leaves Python to others; a large folder takes a while all the same.
+        read = pool.map(_shape_or_error, files)
+        for path, found in zip(
+            files,
+            track(read, f"check {folder.name}", len(files), disable=len(files) < _MANY_FILES, transient=True),
+            strict=True,
+        ):
+            (bad if isinstance(found, RecordingError) else shapes)[path] = found
+    if not shapes:
+        raise RecordingError(f"{folder}: none of {len(files)} pictures can be read. First: {next(iter(bad.values()))}")
+    common, _ = Counter(shapes.values()).most_common(1)[0]
+    bad |= {path: f"{path}: {_size(shape)} pixels." for path, shape in shapes.items() if shape != common}
+    if bad:
+        named = [str(bad[path]) for path in files if path in bad]
+        listed = " ".join(f"({n}) {told}" for n, told in enumerate(named[:_NAMED_FILES], 1))
+        more = f" And {len(named) - _NAMED_FILES} more." if len(named) > _NAMED_FILES else ""
+        raise RecordingError(
+            f"{folder}: {len(named)} of {len(files)} pictures cannot be used; expected whole ones of {_size(common)} "
+            f"pixels, as most are. {listed}{more} Remove or replace them; pictures of another camera go into another folder."
+        )
+    return common
+
+
+def _shape_or_error(path: Path) -> tuple[int, ...] | RecordingError:
+    try:
+        return read_colour(path).shape
+    except RecordingError as error:
+        return error
+
+
+def _size(shape: Sequence[int]) -> str:
+    return f"{shape[1]} x {shape[0]}"
 
 
 def open_sequence(path: str, cache: Path) -> LazyArray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..config import ClipSettings, DataSettings, SimulateSettings, VirtualTagSettings
 from ..data.clips import Clip, load_clip
-from ..data.importers.rgbd_folder import read_labels
+from ..data.picture_files import read_labels
 from ..data.store import open_recording, save_recording
 from ..recording import Recording, RecordingError, TagReads, Truth
 
