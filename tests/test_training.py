@@ -18,6 +18,7 @@ import optax
 import pytest
 import synthetic_clips as synthetic
 
+from tagjax.recording import RecordingError
 from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
 from tagjax.training.loop import DivergedError, LoopSettings, resumed, train
@@ -265,10 +266,25 @@ def test_a_gradient_that_is_not_finite_is_skipped() -> None:
     assert numbers["skipped"] == 0.0
 
 
-def _run(folder: Path, num_steps: int, *, interrupt_at: int | None = None):
+class FailingClips(synthetic.ClipCycle):
+    """Clips whose n-th draw fails, as a file on a disk that went away does."""
+
+    def __init__(self, recordings: list, fail_at: int | None):
+        super().__init__(recordings)
+        self._left = fail_at
+
+    def __next__(self):
+        if self._left is not None:
+            self._left -= 1
+            if not self._left:
+                raise RecordingError("frame 7 cannot be read.")
+        return super().__next__()
+
+
+def _run(folder: Path, num_steps: int, *, interrupt_at: int | None = None, fail_at: int | None = None):
     """A run in a folder, resumed if it holds a checkpoint."""
     state, optimizer = _fresh()
-    clips = synthetic.ClipCycle([synthetic.recording(40)])
+    clips = FailingClips([synthetic.recording(40)], fail_at)
     with Checkpoints(folder / "checkpoints") as checkpoints:
         if checkpoints.steps():
             state, data_state = checkpoints.restore(state)
@@ -312,6 +328,25 @@ def test_resuming_is_exact_bit_for_bit(tmp_path: Path) -> None:
     first = _run(tmp_path / "broken", 6, interrupt_at=2)  # between checkpoints
     assert first.interrupted
     assert int(first.state.step) == 2
+    resumed = _run(tmp_path / "broken", 6)
+    for one, two in zip(jax.tree.leaves(straight.state), jax.tree.leaves(resumed.state), strict=True):
+        np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
+    lines = [(tmp_path / name / "metrics.jsonl").read_text() for name in ("straight", "broken")]
+    assert lines[0] == lines[1]
+
+
+def test_steps_before_samples_that_cannot_be_read_are_kept(tmp_path: Path) -> None:
+    straight = _run(tmp_path / "straight", 6)
+    with pytest.raises(RecordingError, match="frame 7") as told:
+        _run(tmp_path / "new", 6, fail_at=2)
+    assert not hasattr(told.value, "__notes__")
+    # Nothing was done, so nothing is in the way of another try.
+    assert not list((tmp_path / "new" / "checkpoints").iterdir())
+    with pytest.raises(RecordingError, match="frame 7") as told:
+        _run(tmp_path / "broken", 6, fail_at=10)  # the second of the two clips of step 5, between checkpoints
+    assert "saved at step 4" in told.value.__notes__[0]
+    with pytest.raises(RecordingError, match="frame 7"):
+        _run(tmp_path / "broken", 6, fail_at=1)
     resumed = _run(tmp_path / "broken", 6)
     for one, two in zip(jax.tree.leaves(straight.state), jax.tree.leaves(resumed.state), strict=True):
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))

@@ -116,7 +116,7 @@ def train(
     after_step: Callable[[StateT], None] | None = None,
     shown: Sequence[str] = ("loss", "own_coherence"),
 ) -> Trained[StateT]:
-    """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C ends it.
+    """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C or the samples end it.
 
     `update` does one step on this process's share of `batch_size` samples and gives numbers to log, which are the same
     in all processes; `shown` names those beside the progress bar. `validate` gives numbers that are logged under
@@ -134,13 +134,23 @@ def train(
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    done, skipped, share = int(state.step), 0, share_of(settings.batch_size)
+    begun, skipped, share = int(state.step), 0, share_of(settings.batch_size)
+    done = begun
     quiet = not settings.progress or not is_first()
     with _stop_on_interrupt() as stop_asked, Progress(*columns, disable=quiet) as progress:
         task = progress.add_task("train", total=settings.num_steps, completed=done, numbers="compiling")
         stopping = any_process(stop_asked())
         while done < settings.num_steps and not stopping:
-            state, numbers = update(state, [next(samples) for _ in range(share)])
+            place = samples.get_state()
+            try:
+                batch = [next(samples) for _ in range(share)]
+            except Exception as error:
+                # Whatever a source raises, the steps done so far are sound; the batch is drawn again when the run goes on.
+                if done > begun:
+                    checkpoints.save(state, place)
+                    error.add_note(f"The run is saved at step {done} in {checkpoints.folder}; it can go on from there.")
+                raise
+            state, numbers = update(state, batch)
             done += 1
             skipped = skipped + 1 if numbers.get("skipped", 0.0) > 0 else 0
             if skipped == settings.stop_after_skipped:
