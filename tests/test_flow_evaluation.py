@@ -270,6 +270,36 @@ def test_an_evaluation_scores_every_flow_on_every_material(scenes, filmed, tmp_p
     assert len(flow_tables(summary)) == 5
 
 
+def test_scores_before_a_case_that_fails_are_kept_and_called_unfinished(scenes, tmp_path):
+    second = scenes / "still" / "frame11.png"
+    whole = second.read_bytes()
+    second.unlink()
+    settings = FlowEvaluationSettings(
+        flows=("zero", "dis"), num_pairs=2, pairs=SMALL, folders=(str(scenes),), num_panels=0, progress=False
+    )
+    folder = tmp_path / "report"
+    with pytest.raises(RecordingError, match=r"frame11\.png is missing") as told:
+        evaluate_flows(settings, folder)
+    assert "unfinished.md" in told.value.__notes__[0]
+    assert not (folder / "metrics.json").exists()
+    kept = json.loads((folder / "unfinished.json").read_text())
+    assert kept["materials"]["drawn pairs"]["zero"]["all"]["num_pixels"] == 2 * 32 * 48
+    assert list(kept["materials"]["scenes"]["dis"]["sources"]) == ["moved"]
+    text = (folder / "unfinished.md").read_text()
+    assert text.startswith("**Unfinished**: 1 of 3 cases of scenes were scored when it ended (RecordingError")
+    assert "**drawn pairs**" in text
+    second.write_bytes(whole)
+    summary = evaluate_flows(settings, folder)
+    assert "unfinished" not in summary
+    assert sorted(path.name for path in folder.iterdir()) == ["flow.md", "metrics.json"]
+    for name in ("frame10.png", "flow10.flo"):
+        (scenes / "moved" / name).write_bytes(b"")
+    with pytest.raises(RecordingError) as told:
+        evaluate_flows(dataclasses.replace(settings, num_pairs=0), tmp_path / "nothing")
+    assert not hasattr(told.value, "__notes__")
+    assert not (tmp_path / "nothing").exists()
+
+
 def test_drawn_pairs_are_the_same_however_many_are_asked_for():
     few, many = (list(drawn_material(SMALL, number, seed=4).cases()) for number in (2, 9))
     assert len(many) == 9

@@ -95,7 +95,8 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
     """Score every flow on every case; `folder` then holds metrics.json, flow.md and panels/.
 
     The summary: of each material and flow the scores of all its pixels (`all`), those of each source, and the mean over
-    sources of their end-point errors. Raises `ValueError` for unknown flows, and what cannot be read.
+    sources of their end-point errors. Raises `ValueError` for unknown flows, and what cannot be read: then, and on
+    Ctrl-C, unfinished.json and unfinished.md hold the scores of the cases done so far, and say where it ended.
     """
     names = _labels(settings.flows)
     flows = {label: make_flow(name) for label, name in names.items()}
@@ -111,13 +112,32 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
             task = bar.add_task(material.name, total=material.num_cases)
             scored = _Scored(flows, settings)
             wanted = set(np.linspace(0, material.num_cases - 1, settings.num_panels).round().astype(int).tolist())
-            for number, case in enumerate(material.cases()):
-                scored.add(case, folder / "panels" if number in wanted else None)
-                bar.advance(task)
+            done = 0
+            try:
+                for number, case in enumerate(material.cases()):
+                    scored.add(case, folder / "panels" if number in wanted else None)
+                    done += 1
+                    bar.advance(task)
+            except BaseException as error:
+                if done:
+                    summary["materials"][material.name] = scored.result()
+                if summary["materials"]:
+                    ended = f"{done} of {material.num_cases} cases of {material.name} were scored when it ended"
+                    summary["unfinished"] = f"{ended} ({type(error).__name__}: {error})."
+                    _write(summary, folder, "unfinished.json", "unfinished.md")
+                    error.add_note(f"The scores of what was done before are in {folder / 'unfinished.md'}.")
+                raise
             summary["materials"][material.name] = scored.result()
-    write_json(folder / "metrics.json", summary)
-    (folder / "flow.md").write_text(markdown(summary), encoding="utf-8")
+    _write(summary, folder, "metrics.json", "flow.md")
+    for name in ("unfinished.json", "unfinished.md"):  # of an earlier call
+        (folder / name).unlink(missing_ok=True)
     return summary
+
+
+def _write(summary: Mapping[str, Any], folder: Path, numbers: str, tables: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / numbers, summary)
+    (folder / tables).write_text(markdown(summary), encoding="utf-8")
 
 
 def _labels(names: Sequence[str]) -> dict[str, str]:
@@ -244,8 +264,8 @@ def flow_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def markdown(summary: Mapping[str, Any]) -> str:
-    """The same tables as Markdown."""
-    parts = []
+    """The same tables as Markdown; first of all, whether they are not of all cases."""
+    parts = [f"**Unfinished**: {summary['unfinished']}\n"] if "unfinished" in summary else []
     for title, headings, rows in _tables(summary):
         lines = [headings, ["---", *["---:"] * (len(headings) - 1)], *rows]
         parts.append(f"**{title}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n")
