@@ -35,6 +35,7 @@ from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
 from tagjax.recording import RecordingError
 from tagjax.sim.flow_pairs import FlowPair, FlowPairSettings
+from tagjax.training import flow_sources
 from tagjax.training.checkpoint import Checkpoints
 from tagjax.training.flow_run import flow_of, flow_of_peer, run_flow_training, scores
 from tagjax.training.flow_sources import DrawnSettings, drawn_pairs, flow_dataset, validation_pairs
@@ -381,6 +382,28 @@ def test_a_teacher_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
     assert not list(tmp_path.iterdir())
 
 
+def test_a_teacher_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tagjax.training import flow_teacher
+
+    asked = []
+
+    def teacher(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        asked.append(int(first[0, 0, 0]))
+        if len(asked) == 4:
+            raise KeyboardInterrupt
+        return np.full((*first.shape[:2], 2), first[0, 0, 0], np.float32)
+
+    monkeypatch.setattr(flow_teacher, "make_flow", lambda name: teacher)
+    monkeypatch.setattr(flow_teacher, "_SHARD", 2)
+    pairs = np.broadcast_to(np.arange(5, dtype=np.uint8).reshape(5, 1, 1, 1, 1), (5, 2, 32, 32, 3))
+    with pytest.raises(KeyboardInterrupt):
+        taught_flow(pairs, "dis", tmp_path, progress=False)
+    flows = taught_flow(pairs, "dis", tmp_path, progress=False)
+    assert asked == [0, 1, 2, 3, 2, 3, 4]
+    np.testing.assert_array_equal(flows[:, 0, 0, 0], np.arange(5))
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_student_is_given_its_teachers_flow_of_drawn_pairs_and_of_cuts(tmp_path: Path) -> None:
     (tmp_path / "walk").mkdir()
     for number, picture in enumerate(smooth_pictures(5, 48, 64)):
@@ -477,6 +500,25 @@ def test_drawn_pairs_are_made_once_and_follow_from_the_seed(tmp_path: Path) -> N
     assert not any(np.array_equal(np.asarray(held_out.first[i] * 255, np.uint8), one[0, 0]) for i in range(16))
     with pytest.raises(ValueError, match="multiple of 16"):
         drawn(tmp_path, num_pairs=10)
+
+
+def test_drawn_pairs_go_on_where_drawing_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn_at, batch_of = [], flow_sources._batch
+
+    def noted(settings: DrawnSettings, photos: np.ndarray | None, seed: int, start: int) -> FlowPair:
+        drawn_at.append(start)
+        if drawn_at == [0, 16, 32]:
+            raise KeyboardInterrupt
+        return batch_of(settings, photos, seed, start)
+
+    monkeypatch.setattr(flow_sources, "_batch", noted)
+    monkeypatch.setattr(flow_sources, "_SHARD", 32)
+    with pytest.raises(KeyboardInterrupt):
+        drawn_pairs(drawn(tmp_path / "one", num_pairs=48), progress=False)
+    found = drawn_pairs(drawn(tmp_path / "one", num_pairs=48), progress=False)
+    assert drawn_at == [0, 16, 32, 32]
+    assert len(list((tmp_path / "one").iterdir())) == 1
+    np.testing.assert_array_equal(found[:], drawn_pairs(drawn(tmp_path / "two", num_pairs=48), progress=False)[:])
 
 
 # The update

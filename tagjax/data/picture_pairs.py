@@ -9,10 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-import os
 import re
-import shutil
-import uuid
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +26,7 @@ from rich.progress import Progress, track
 from .._types import LazyArray
 from ..recording import RecordingError
 from .picture_files import read_colour
+from .prepared import made_once
 from .store import open_recording
 from .stream import Stream
 
@@ -182,12 +180,10 @@ def _decoded(video: Path, cache: Path) -> LazyArray:
     """The frames of a video, from the cache if it was decoded before."""
     stamp = f"{_DECODING} {video.resolve()} {video.stat().st_size} {video.stat().st_mtime_ns}"
     target = cache / f"{video.stem}-{hashlib.sha256(stamp.encode()).hexdigest()[:12]}.zarr"
-    if not target.exists():
-        _decode(video, target)
-    return cast(LazyArray, zarr.open_array(str(target), mode="r"))
+    return made_once(target, lambda path: _decode(video, path))
 
 
-def _decode(video: Path, target: Path) -> None:
+def _decode(video: Path, path: Path) -> None:
     """Write the frames (frame, height, width, 3) of a video. Raises `RecordingError` for fewer than two."""
     capture = cv2.VideoCapture(str(video))
     try:
@@ -198,22 +194,17 @@ def _decode(video: Path, target: Path) -> None:
         size = (round(picture.shape[1] * factor), round(picture.shape[0] * factor))
         # Streamed videos say nothing, or nonsense: the bar alone believes it.
         stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
-        try:
-            shape = (0, size[1], size[0], 3)
-            kept = zarr.create_array(str(partial), shape=shape, dtype="uint8", chunks=(1, *shape[1:]))
-            with Progress(transient=True) as bar:
-                task = bar.add_task(f"decode {video.name}", total=stated if 0 < stated < math.inf else None)
-                while ok:
-                    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
-                    kept.append(np.ascontiguousarray(small)[None])
-                    bar.advance(task)
-                    ok, picture = capture.read()
-            if kept.shape[0] < 2:
-                raise RecordingError(f"{video} holds {kept.shape[0]} picture that can be decoded; a flow needs two.")
-            os.replace(partial, target)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        shape = (0, size[1], size[0], 3)
+        kept = zarr.create_array(str(path), shape=shape, dtype="uint8", chunks=(1, *shape[1:]))
+        with Progress(transient=True) as bar:
+            task = bar.add_task(f"decode {video.name}", total=stated if 0 < stated < math.inf else None)
+            while ok:
+                small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[..., ::-1]
+                kept.append(np.ascontiguousarray(small)[None])
+                bar.advance(task)
+                ok, picture = capture.read()
+        if kept.shape[0] < 2:
+            raise RecordingError(f"{video} holds {kept.shape[0]} picture that can be decoded; a flow needs two.")
     finally:
         capture.release()
 

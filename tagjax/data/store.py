@@ -6,9 +6,9 @@ import dataclasses
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import zarr
@@ -311,23 +311,3 @@ def create_array(root: zarr.Group, name: str, shape: tuple[int, ...], dtype: Any
         compressors=[ZstdCodec(level=3, checksum=True)],
         config={"write_empty_chunks": True},
     )
-
-
-def made_once(target: Path, make: Callable[[Path], None]) -> LazyArray:
-    """The array at `target`, which `make` writes at the path that it is given, where it is not there yet.
-
-    What is left unfinished is removed. Of several processes that make it at once, the first one's stays.
-    """
-    if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
-        try:
-            make(partial)
-            os.replace(partial, target)
-        except OSError:
-            # Another process may have been faster: what it made is the same.
-            if not target.exists():
-                raise
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    return cast(LazyArray, zarr.open_array(str(target), mode="r"))

@@ -5,16 +5,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-import zarr
 from jaxtyping import UInt8
-from rich.progress import track
 
 from .._types import LazyArray
 from ..data.picture_pairs import (
@@ -25,7 +23,7 @@ from ..data.picture_pairs import (
     open_sequence,
     pair_dataset,
 )
-from ..data.store import made_once
+from ..data.prepared import made_once, write_rows
 from ..data.stream import Stream
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.textures import PHOTOGRAPHS, photograph
@@ -115,27 +113,22 @@ def drawn_pairs(settings: DrawnSettings, *, progress: bool = True) -> LazyArray:
 
 
 def _draw(settings: DrawnSettings, path: Path, about: dict, progress: bool) -> None:
-    one = (2, settings.pairs.height, settings.pairs.width, 3)
-    kept = zarr.create_array(
-        str(path),
-        shape=(settings.num_pairs, *one),
-        dtype="uint8",
-        chunks=(1, *one),
-        shards=(_SHARD, *one),
-        attributes={"about": about},
-    )
     photos = _photographs(settings)
-    held: list[np.ndarray] = []
-    written = 0
-    for start in track(
-        range(0, settings.num_pairs, _BATCH), description="draw flow pairs", disable=not progress, transient=True
-    ):
-        drawn = _batch(settings, photos, settings.seed, start)
-        held.append(to_bytes(drawn))
-        if len(held) * _BATCH >= _SHARD or start + _BATCH >= settings.num_pairs:
-            block = np.concatenate(held)
-            kept[written : written + len(block)] = block
-            written, held = written + len(block), []
+
+    def rows(first: int) -> Iterator[np.ndarray]:
+        for start in range(first, settings.num_pairs, _BATCH):
+            yield to_bytes(_batch(settings, photos, settings.seed, start))
+
+    write_rows(
+        path,
+        rows,
+        shape=(settings.num_pairs, 2, settings.pairs.height, settings.pairs.width, 3),
+        dtype="uint8",
+        shard=_SHARD,
+        attributes={"about": about},
+        description="draw flow pairs",
+        progress=progress,
+    )
 
 
 def _batch(settings: DrawnSettings, photos: np.ndarray | None, seed: int, start: int) -> FlowPair:

@@ -6,16 +6,14 @@ The teacher is any flow by name, slow and exact for example; the student, a netw
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import zarr
 from jaxtyping import UInt8
-from rich.progress import track
 
 from .._types import LazyArray
-from ..data.store import made_once
+from ..data.prepared import made_once, write_rows
 from ..flow.named import flow_key, make_flow
 from ..recording import RecordingError
 
@@ -69,20 +67,22 @@ def taught_flow(
 def _teach(pairs: LazyArray | np.ndarray, teacher: str, path: Path, progress: bool) -> None:
     flow = make_flow(teacher)
     count, _, height, width, _ = pairs.shape
-    one = (height, width, 2)
-    kept = zarr.create_array(
-        str(path),
-        shape=(count, *one),
+
+    def rows(begin: int) -> Iterator[np.ndarray]:
+        for number in range(begin, count):
+            first, second = np.asarray(pairs[number])
+            yield np.asarray(flow(first, second)).astype(np.float16)[None]
+
+    write_rows(
+        path,
+        rows,
+        shape=(count, height, width, 2),
         dtype="float16",
-        chunks=(1, *one),
-        shards=(_SHARD, *one),
+        shard=_SHARD,
         attributes={"teacher": teacher},
+        description=f"flow by {teacher}",
+        progress=progress,
     )
-    starts = range(0, count, _SHARD)
-    for start in track(starts, description=f"flow by {teacher}", disable=not progress, transient=True):
-        block = np.asarray(pairs[start : start + _SHARD])
-        flows = [np.asarray(flow(first, second)) for first, second in block]
-        kept[start : start + len(block)] = np.stack(flows).astype(np.float16)
 
 
 def _digest(pairs: LazyArray | np.ndarray) -> str:
