@@ -8,15 +8,20 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import synthetic_clips as synthetic
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from experiments.compare import suites_named, with_suites
 from tagjax.config import ConfigError, from_mapping
-from tagjax.evaluation.compare import Cell, CompareConfig, console_table, markdown, run_comparison
+from tagjax.evaluation.compare import Cell, CompareConfig, Systems, console_table, markdown, run_comparison
+from tagjax.evaluation.compare._run import _score, _Tally
 from tagjax.evaluation.compare._table import bars, write_csv
+from tagjax.sim.suites import Item, Suite, Variant
+from tagjax.tracer import Trace
 from tagjax.viz.comparison import bar_plot
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -62,6 +67,46 @@ def test_bars_are_drawn_where_there_are_figures(tmp_path: Path):
     assert bars(CELLS, "iou") == {"tagattention": {"a": 0.61, "b": None}, "tagview": {"a": None}}
     bar_plot(tmp_path / "c.png", {"identification": bars(CELLS, "identification"), "box IoU": bars(CELLS, "iou")})
     assert (tmp_path / "c.png").stat().st_size > 5000
+
+
+def test_false_alarms_are_claims_of_tags_that_lie_still_labelled_or_not(monkeypatch: pytest.MonkeyPatch):
+    """One is moved, one lies on a shelf and is no labelled object, one is carried out of sight: neither seen nor still."""
+    drawn, num = synthetic.recording(12), 12
+    assert drawn.truth is not None
+    names = [*synthetic.EPCS, "shelf", "hidden"]
+    epc = np.where(np.arange(len(drawn.reads.epc)) % 7 == 0, "shelf", drawn.reads.epc)
+    reads = dataclasses.replace(drawn.reads, epc=np.where(np.arange(len(epc)) % 7 == 1, "hidden", epc))
+    going = np.stack([np.linspace(0, 1, num), np.zeros(num), np.full(num, 2.0)], axis=-1)
+    resting = np.broadcast_to(going[:1], going.shape).copy()
+    resting[3] = np.nan  # not known at a frame
+    truth = dataclasses.replace(
+        drawn.truth, tag_position_m={"tag-a": going, "tag-b": going, "shelf": resting, "hidden": going}
+    )
+    recording = dataclasses.replace(drawn.with_reads(reads), truth=truth)
+    order = recording.resolve_epcs(None)
+    assert sorted(order) == sorted(names)
+
+    def said(number: int) -> Trace:
+        claimed = {"tag-a": True, "tag-b": False, "shelf": number in (3, 4, 9), "hidden": True}
+        return Trace(
+            mask=jnp.zeros((4, synthetic.HEIGHT, synthetic.WIDTH)),
+            box_px=jnp.zeros((4, 4)),
+            centre_px=jnp.zeros((4, 2)),
+            centre_m=jnp.zeros((4, 3)),
+            step_m=jnp.zeros((4, 1)),
+            confidence=jnp.full(4, 0.45),  # a claim counts alike in P_D and P_FA, whatever it is worth
+            found=jnp.array([claimed[one] for one in order]),
+        )
+
+    config = _config(["occlusion"])
+    monkeypatch.setattr(Systems, "traces", lambda *_: iter([(number, said(number)) for number in range(num)]))
+    monkeypatch.setattr(Systems, "stride", lambda *_: 1)
+    systems, tally = Systems(config.systems, config.scores), _Tally()
+    item = Item(from_mapping(Suite, config.suites["occlusion"]), Variant("all"), "test", 0, 1)
+    scores = dataclasses.replace(config.scores, moved_for_s=0.0, min_pixels=2)
+    _score(systems, "tagview", item, recording, scores, tally)
+    assert np.mean(np.concatenate(tally.still)) == pytest.approx(3 / num)
+    assert tally.scores.result()["false_claims"] == pytest.approx((3 + num) / (2 * num))
 
 
 def test_what_cannot_be_compared_is_refused():

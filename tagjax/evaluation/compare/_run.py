@@ -24,8 +24,8 @@ from ..report import write_json
 from ._systems import NAMES, Systems, SystemSettings
 from ._table import HEADS, MEASURES, Cell, bars, markdown, said, write_csv
 
-_CLAIM = 0.5
-"""Confidence from which a found tag counts as claimed."""
+Claims = tuple[np.ndarray, np.ndarray]
+"""Of every tag at one frame: its place in metres (tag, 3), and whether an object is claimed at all (tag,)."""
 
 _STILL_M = 0.05
 """A tag that never goes further than this from where it mostly is lies still."""
@@ -144,8 +144,8 @@ def _score(
 ) -> None:
     epcs = recording.resolve_epcs(None)
     elapsed_s: list[float] = []
-    places: list[np.ndarray] = []
-    traces = _watched(systems.traces(system, item, recording, epcs), elapsed_s, places)
+    claims: list[Claims] = []
+    traces = _watched(systems.traces(system, item, recording, epcs), elapsed_s, claims)
     quiet = dataclasses.replace(settings, num_pictures=1)
     result = score_traces(traces, recording, epcs, stride=systems.stride(system, item), settings=quiet)
     tally.scores = tally.scores.merge(result.scores())
@@ -153,35 +153,37 @@ def _score(
     # The first piece compiles and fills caches.
     first = min(settings.frames_at_once, len(elapsed_s) // 2)
     tally.pace_ms.append(1e3 * float(np.mean(elapsed_s[first:])))
-    _tally_places(result, epcs, np.stack(places), tally)
+    _tally_places(result, epcs, claims, tally)
 
 
-def _tally_places(result: RecordingResult, epcs: list[str], place_m: np.ndarray, tally: _Tally) -> None:
+def _tally_places(result: RecordingResult, epcs: Sequence[str], claims: Sequence[Claims], tally: _Tally) -> None:
+    """Errors of the labelled tags' claimed places; claims of tags that lie still, most of which no label stands for."""
     truth = result.recording.truth
+    place_m, found = (np.stack(parts) for parts in zip(*claims, strict=True))
     for tag, epc in enumerate(epcs):
-        frames = result.frames.get(epc)
-        if frames is None:
-            continue
         if truth is None or epc not in truth.tag_position_m:
             continue
         true_m = np.asarray(truth.tag_position_m[epc], np.float64)
-        if np.nanmax(np.linalg.norm(true_m - np.nanmedian(true_m, axis=0), axis=-1)) < _STILL_M:
-            tally.still.append((frames.found & (frames.confidence >= _CLAIM)).astype(np.float64))
-        gap = np.linalg.norm(place_m[:, tag] - true_m, axis=-1)
-        tally.error_m.append(gap[frames.valid & frames.found])
+        known_m = true_m[np.isfinite(true_m).all(axis=-1)]
+        if len(known_m) and np.linalg.norm(known_m - np.median(known_m, axis=0), axis=-1).max() < _STILL_M:
+            tally.still.append(found[:, tag].astype(np.float64))
+        frames = result.frames.get(epc)
+        if frames is not None:
+            gap = np.linalg.norm(place_m[:, tag] - true_m, axis=-1)
+            tally.error_m.append(gap[frames.valid & frames.found])
 
 
 def _watched(
-    traces: Iterator[tuple[int, Trace]], elapsed_s: list[float], places: list[np.ndarray]
+    traces: Iterator[tuple[int, Trace]], elapsed_s: list[float], claims: list[Claims]
 ) -> Iterator[tuple[int, Trace]]:
-    """The same traces; notes how long each took to come, and where it puts the tags."""
+    """The same traces; notes how long each took to come, and what it claims."""
     while True:
         begun = time.perf_counter()
         found = next(traces, None)
         if found is None:
             return
         elapsed_s.append(time.perf_counter() - begun)
-        places.append(np.asarray(found[1].centre_m, np.float64))
+        claims.append((np.asarray(found[1].centre_m, np.float64), np.asarray(found[1].found, bool)))
         yield found
 
 

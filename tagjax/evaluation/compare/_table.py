@@ -17,7 +17,7 @@ class Cell:
 
     identification, iou, cle_px: over frames in which the tagged thing has moved and shows (`ScoreSettings`).
     error_mm: median distance of the claimed place and the tag. p_d: share of those frames with any claim. p_fa: share
-    of frames with a claim (confidence at least 0.5) of a tag that never moves. ms_a_frame: detection, radio and decision together.
+    of all frames with any claim of a tag that never moves, labelled or not. ms_a_frame: detection, radio and decision together.
     """
 
     suite: str
