@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,12 @@ import pytest
 import synthetic_clips as synthetic
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from rich.console import Console
+from rich.table import Table
 
 from experiments.compare import suites_named, with_suites
 from tagjax.config import ConfigError, from_mapping
-from tagjax.evaluation.compare import Cell, CompareConfig, Systems, console_table, markdown, run_comparison
+from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
 from tagjax.evaluation.compare._run import _score, _Tally
 from tagjax.evaluation.compare._table import bars, write_csv
 from tagjax.sim.suites import Item, Suite, Variant
@@ -37,21 +40,62 @@ def _config(suites: list[str], **changes: Any) -> CompareConfig:
 
 CELLS = [
     Cell("a", "tagattention", 2, 40, 0.9, 0.61, 12.3, 45.6, 1.0, None, 7.8, settings="people"),
-    Cell("a", "tagview", reason="the camera looks along the room"),
+    Cell("a", "tagview", reason="the camera looks along the room", paper="0.97 of theirs"),
     Cell("b", "tagattention", 1, 10, 0.5, None, None, None, 0.0, 0.25, 8.0),
 ]
 
 
+def _printed(table: Table) -> str:
+    console = Console(width=80, file=io.StringIO())
+    console.print(table)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
 def test_the_table_says_figures_reasons_and_what_the_papers_say():
-    lines = markdown(CELLS, {"a": "0.97 of theirs"}).splitlines()
+    table, legend = markdown(CELLS).split("\n\n", maxsplit=1)
+    lines = table.splitlines()
     assert len({line.count("|") for line in lines}) == 1
-    assert lines[2] == "| `a` | tagattention (people) | 0.900 | 0.610 | 12 | 46 | 1.000 | - | 8 | 2 | 0.97 of theirs |"
+    assert lines[2] == "| `a` | tagattention (people) | 0.900 | 0.610 | 12 | 46 | 1.000 | - | 8 | 2 |  |"
     assert "does not apply: the camera looks along the room" in lines[3]
-    assert "0.97 of theirs" not in lines[3]
+    assert lines[3].endswith("| 0.97 of theirs |")
     assert " 0.250 " in lines[4]
+    assert "P_D: share of those frames with any claim" in legend
+    assert "|" not in legend
     table = console_table(CELLS)
     assert table.row_count == 3
-    assert "(1) does not apply: the camera" in str(table.caption)
+    said = _printed(table)
+    assert "(1) does not apply: the camera" in said
+    assert "tagview's own paper, a: 0.97 of theirs" in said
+    assert "its settings for people: a" in said
+
+
+def test_no_name_or_figure_is_cut_on_eighty_columns():
+    """Of the longest suites and systems there are, with the widest figures that are to be expected."""
+    cells = [
+        Cell(path.stem, system, 12, 1234, 0.912, 0.934, 123.4, 1234.5, 0.956, 0.978, 1234.5, settings="handheld")
+        for path in (CONF / "benchmark").glob("*.yaml")
+        for system in NAMES
+    ]
+    lines = _printed(console_table(cells)).splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line.split() for line in lines]
+    for cell in cells:
+        assert [cell.suite, cell.system, "0.912", "0.934", "123", "1234", "0.956", "0.978", "1234"] in rows
+
+
+def test_each_papers_figures_stand_with_its_own_system():
+    papers = _config(["occlusion"]).papers
+    assert set(papers) <= {path.stem for path in (CONF / "benchmark").glob("*.yaml")}
+    assert {suite: list(of) for suite, of in papers.items()} == {
+        "planar_tracks": ["tagvision"],
+        **{f"ceiling_{count}": ["tagview"] for count in range(2, 7)},
+        "separated_traces": ["tagview"],
+        "half_wavelength": ["tagview"],
+        "shop_exit": ["goller"],
+    }
+    with pytest.raises(ConfigError, match=r"papers: unknown systems blob; expected some of tagattention, .*goller"):
+        _config(["occlusion"], papers={"occlusion": {"blob": "0.9"}})
 
 
 def test_the_csv_holds_every_field(tmp_path: Path):
@@ -61,6 +105,7 @@ def test_the_csv_holds_every_field(tmp_path: Path):
     assert float(rows[0]["iou"]) == 0.61
     assert rows[1]["iou"] == ""
     assert rows[1]["reason"] == "the camera looks along the room"
+    assert [row["paper"] for row in rows] == ["", "0.97 of theirs", ""]
 
 
 def test_bars_are_drawn_where_there_are_figures(tmp_path: Path):
@@ -139,6 +184,7 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
         assert (cell.ms_a_frame or 0) > 0
     written = json.loads((tmp_path / "out" / "table.json").read_text())
     assert [one["system"] for one in written] == ["tagattention_paper", "tagvision", "goller"]
+    assert [one["paper"] for one in written] == [None, config.papers["planar_tracks"]["tagvision"], None]
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()
     assert any("simulated" in line for line in told)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
+from rich.text import Text
 
 from ...config import ConfigError, from_mapping
 from ...data.store import open_recording
@@ -22,7 +23,7 @@ from ..evaluate import RecordingResult, ScoreSettings, score_traces
 from ..metrics import Scores
 from ..report import write_json
 from ._systems import NAMES, Systems, SystemSettings
-from ._table import HEADS, MEASURES, Cell, bars, markdown, said, write_csv
+from ._table import LEGEND, MEASURES, SHORT, Cell, bars, markdown, said, write_csv
 
 Claims = tuple[np.ndarray, np.ndarray]
 """Of every tag at one frame: its place in metres (tag, 3), and whether an object is claimed at all (tag,)."""
@@ -43,7 +44,9 @@ class CompareConfig:
     most: int | None = None  # recordings of each variant; all if None
     smoke: bool = False
     workers: int = 1
-    papers: Mapping[str, str] = dataclasses.field(default_factory=dict)  # what a suite's own paper reports
+    papers: Mapping[str, Mapping[str, str]] = dataclasses.field(
+        default_factory=dict
+    )  # by suite and system: its paper's
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 
     def __post_init__(self) -> None:
@@ -51,6 +54,10 @@ class CompareConfig:
             raise ConfigError("No suite to compare on: benchmark=[single_static,planar_tracks], for example.")
         if unknown := sorted(set(self.only) - set(NAMES)):
             raise ConfigError(f"Unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)}.")
+        if unknown := sorted({name for of in self.papers.values() for name in of} - set(NAMES)):
+            raise ConfigError(
+                f"papers: unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)} below each suite."
+            )
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
         if self.most is not None and self.most < 1:
@@ -78,8 +85,9 @@ def run_comparison(
     for name, values in config.suites.items():
         items = _items(config, from_mapping(Suite, values, where=f"benchmark {name}"), tell)
         for system in config.only:
-            cells.append(_cell(systems, system, name, items, config, tell))
-        _write(folder, cells, config.papers)
+            cell = _cell(systems, system, name, items, config, tell)
+            cells.append(dataclasses.replace(cell, paper=config.papers.get(name, {}).get(system)))
+        _write(folder, cells)
     return cells
 
 
@@ -188,8 +196,13 @@ def _watched(
 
 
 def console_table(cells: Iterable[Cell]) -> Table:
-    """The table for a terminal; why a method does not apply stands below it."""
-    table = Table("suite", "system", *HEADS, box=SIMPLE)
+    """The table for a terminal of 80 columns; why a method does not apply, the papers' figures, the legend stand below."""
+    cells = list(cells)
+    table = Table(box=SIMPLE, show_edge=False, padding=0)
+    for name in ("suite", "system"):
+        table.add_column(name, no_wrap=True)
+    for name in SHORT:
+        table.add_column(name, no_wrap=True, justify="right")
     reasons: list[str] = []
     for cell in cells:
         values = [said(getattr(cell, measure), measure) for measure in MEASURES]
@@ -197,16 +210,21 @@ def console_table(cells: Iterable[Cell]) -> Table:
             if cell.reason not in reasons:
                 reasons.append(cell.reason)
             values = [f"({reasons.index(cell.reason) + 1})", *[""] * (len(MEASURES) - 1)]
-        table.add_row(cell.suite, cell.name, *values)
-    table.caption = (
-        "\n".join(f"({number}) does not apply: {reason}" for number, reason in enumerate(reasons, 1)) or None
-    )
+        table.add_row(cell.suite, cell.system, *values)
+    ways: dict[str, list[str]] = {}
+    for cell in cells:
+        if cell.settings is not None and cell.suite not in (on := ways.setdefault(cell.settings, [])):
+            on.append(cell.suite)
+    below = [f"({number}) does not apply: {reason}" for number, reason in enumerate(reasons, 1)]
+    below += [f"TagAttention with its settings for {way}: {', '.join(suites)}" for way, suites in ways.items()]
+    below += [f"{cell.system}'s own paper, {cell.suite}: {cell.paper}" for cell in cells if cell.paper is not None]
+    table.caption = Text("\n".join([*below, *LEGEND]))
     table.caption_justify = "left"
     return table
 
 
-def _write(folder: Path, cells: list[Cell], papers: Mapping[str, str]) -> None:
-    (folder / "table.md").write_text(markdown(cells, papers) + "\n", encoding="utf-8")
+def _write(folder: Path, cells: list[Cell]) -> None:
+    (folder / "table.md").write_text(markdown(cells) + "\n", encoding="utf-8")
     write_csv(folder / "table.csv", cells)
     write_json(folder / "table.json", [dataclasses.asdict(cell) for cell in cells])
     bar_plot(

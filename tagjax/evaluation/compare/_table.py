@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 MEASURES = ("identification", "iou", "cle_px", "error_mm", "p_d", "p_fa", "ms_a_frame")
 HEADS = ("identification", "box IoU", "CLE, px", "error, mm", "P_D", "P_FA", "ms a frame")
+SHORT = ("ident", "IoU", "CLE", "error", "P_D", "P_FA", "ms")
+"""The same where there is room for 80 columns: no wider than the figures below them."""
+
+LEGEND = (
+    "identification, box IoU, CLE (px of a picture 512 wide): of frames in which the tagged thing has moved and shows.",
+    "error: median distance in mm of the claimed place and the tag. P_D: share of those frames with any claim, right or "
+    "wrong; P_FA: share of all frames with any claim of a tag that lies still. ms: of a frame.",
+    "The papers' own figures are of their own recordings, and of other quantities: matching, accuracy, precision and recall "
+    "of whole tracks or traces, TagVision's error the mean from the middle of what is tracked, Goller et al.'s P_D and P_FA "
+    "shares of tags that were alarmed. experiments.tagvision, experiments.tagview and experiments.goller measure those.",
+)
+"""What the columns are, and where the papers' quantities differ."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +45,7 @@ class Cell:
     ms_a_frame: float | None = None
     reason: str | None = None
     settings: str | None = None  # which of several the system took
+    paper: str | None = None  # what the system's paper reports of such recordings
 
     @property
     def name(self) -> str:
@@ -47,22 +60,19 @@ def said(value: float | None, measure: str) -> str:
     return f"{value:.0f}" if measure in ("error_mm", "ms_a_frame", "cle_px") else f"{value:.3f}"
 
 
-def markdown(cells: Sequence[Cell], papers: Mapping[str, str]) -> str:
-    """The table: a row a suite and system, the papers' own figures in a column of their own."""
+def markdown(cells: Sequence[Cell]) -> str:
+    """The table: a row a suite and system, the papers' own figures in a column of their own; the legend below."""
     lines = [
         "| suite | system | " + " | ".join(HEADS) + " | recordings | the paper's own |",
         "|" + "---|" * (len(HEADS) + 4),
     ]
-    shown: set[str] = set()
     for cell in cells:
-        paper = "" if cell.suite in shown else papers.get(cell.suite, "")
-        shown.add(cell.suite)
         if cell.reason is None:
             values = " | ".join(said(getattr(cell, measure), measure) for measure in MEASURES)
         else:
             values = f"does not apply: {cell.reason}" + " |" * (len(HEADS) - 1)
-        lines.append(f"| `{cell.suite}` | {cell.name} | {values} | {cell.num_recordings or ''} | {paper} |")
-    return "\n".join(lines)
+        lines.append(f"| `{cell.suite}` | {cell.name} | {values} | {cell.num_recordings or ''} | {cell.paper or ''} |")
+    return "\n".join([*lines, "", "\n\n".join(LEGEND)])
 
 
 def write_csv(path: Path, cells: Sequence[Cell]) -> None:
