@@ -190,3 +190,12 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     assert any("simulated" in line for line in told)
     assert (paper.settings, vision.settings) == ("people", None)
     assert np.isfinite(vision.error_mm if vision.error_mm is not None else 0.0)
+
+
+def test_a_suite_without_pictures_is_said_to_be_one_and_the_others_go_on(tmp_path: Path):
+    config = _config(["planar_101", "planar_tracks"], smoke=True, most=1, out=str(tmp_path / "made"), only=("goller",))
+    lines, table = run_comparison(config, tmp_path / "out")
+    assert lines.reason == "no pictures: lines only"
+    assert table.reason == "location by proximity needs several antennas"
+    alone = dataclasses.replace(config, suites={"planar_101": config.suites["planar_101"]})
+    assert [cell.reason for cell in run_comparison(alone, tmp_path / "alone")] == [lines.reason]

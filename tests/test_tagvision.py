@@ -35,7 +35,7 @@ from tagjax.baselines.tagvision import (
     residuals_rad,
     theory_rad,
 )
-from tagjax.config import from_mapping
+from tagjax.config import ConfigError, from_mapping
 from tagjax.evaluation.tagvision import (
     LineSettings,
     TagVisionExperiment,
@@ -392,6 +392,14 @@ def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "lines.png")) is not None
     with pytest.raises(ValueError, match="split is 'all'"):
         dataclasses.replace(config, split="all")
+
+
+def test_a_suite_of_lines_has_nothing_that_moves_over_a_table(tmp_path: Path) -> None:
+    values = _compose("tagvision", "benchmark=planar_101", f"out={tmp_path / 'recordings'}")
+    values.pop("progress")
+    with pytest.raises(ConfigError, match=r"planar_101 has no pictures.*benchmark=planar_tracks"):
+        run_tagvision(from_mapping(TagVisionExperiment, values), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import numpy as np
 from ...baselines.tagvision import MatchSettings, TagVisionSettings
 from ...config import ConfigError, from_mapping
 from ...data.store import open_recording
-from ...sim.suites import SPLITS, Item, Suite, make_suite
+from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_suite
 from ...viz.tagvision import error_plot, line_plot, matching_plot
 from ..report import write_json
 from ._calibration import PAPER_CAMERA, CalibrationSettings, calibrated, overhead, transform_error_m
@@ -50,8 +50,17 @@ class TagVisionExperiment:
 def run_tagvision(
     config: TagVisionExperiment, folder: Path, *, on_progress: Callable[[str], None] | None = None
 ) -> dict[str, Any]:
-    """Run what the configuration names; writes `metrics.json`, `table.md`, `tags.csv` and plots, returns the metrics."""
+    """Run what the configuration names; writes `metrics.json`, `table.md`, `tags.csv` and plots, returns the metrics.
+
+    Raises `ConfigError`, before anything is done, for a suite without pictures.
+    """
     tell = on_progress or (lambda _: None)
+    suite = None if config.benchmark is None else from_mapping(Suite, config.benchmark, where="benchmark")
+    if suite is not None and suite.story == PLANAR:
+        raise ConfigError(
+            f"{suite.name} has no pictures, only the phases of lines, which are scored without benchmark= as well (see "
+            "`lines`). Leave it out, or choose a suite of things that move over a table: benchmark=planar_tracks."
+        )
     folder.mkdir(parents=True, exist_ok=True)
     metrics: dict[str, Any] = {"paper": PAPER}
     tell("parallel lines")
@@ -62,8 +71,7 @@ def run_tagvision(
         line_plot(folder / "lines.png", lines[0].line_m, panels, float(lines[0].line_m[lines[0].true_line]))
     tell("calibration")
     metrics["calibration"] = _calibrations(config)
-    if config.benchmark is not None:
-        suite = from_mapping(Suite, config.benchmark, where="benchmark")
+    if suite is not None:
         suite = suite.smoke() if config.smoke else suite
         make_suite(suite, Path(config.out), workers=config.workers, on_done=lambda made: tell(f"simulated {made.name}"))
         items = [item for item in suite.items() if item.split == config.split]
