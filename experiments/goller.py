@@ -2,7 +2,7 @@
 
 python -m experiments.simulate benchmark=shop_grid     # and shop_exit, shop_handover
 python -m experiments.goller
-python -m experiments.goller handover=recordings/benchmark/shop_handover
+python -m experiments.goller handover=<recording>      # not those of shop_handover beside the scenarios
 python -m experiments.goller scenarios=<folder of the suite> most=3 fit_steps=0
 """
 
@@ -35,6 +35,9 @@ def main(config: DictConfig) -> None:
         checked = from_mapping(GollerConfig, values)
         metrics = run_goller(checked, open_recording, folder, on_done=lambda name: status.update(f"observed {name}"))
     console.print((folder / "tables.md").read_text(), markup=False)
+    if metrics["handover"] is None:
+        told = "no hand-over: `python -m experiments.simulate benchmark=shop_handover` makes recordings of some"
+        console.print(told, soft_wrap=True, highlight=False)
     console.print(f"run folder: {folder}")
     print(json.dumps(metrics, allow_nan=False))
 

@@ -67,6 +67,7 @@ from tagjax.evaluation.goller import (
     scenario_paths,
     thresholds,
 )
+from tagjax.evaluation.goller._run import _handover_paths
 from tagjax.evaluation.goller._tables import interval
 from tagjax.recording import Intrinsics, Recording, RecordingError, TagReads, Truth
 
@@ -1177,6 +1178,35 @@ def test_the_configuration_names_every_setting():
     assert set(values) == names(GollerConfig)
     assert set(values["settings"]) == names(GollerSettings)
     assert set(values["settings"]["blobs"]) == names(BlobSettings)
+
+
+def test_all_that_is_missing_is_named_before_anything_is_observed(tmp_path):
+    """With the commands that make it."""
+
+    def opened(path: str) -> Recording:
+        raise AssertionError(f"{path} is opened, though something is missing")
+
+    grid, shop = tmp_path / "grid.zarr", tmp_path / "shop_exit"
+    config = GollerConfig(grid=str(grid), scenarios=str(shop), handover=str(tmp_path / "nowhere"))
+    with pytest.raises(ValueError, match=r"benchmark=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
+        run_goller(config, opened, tmp_path)
+    grid.mkdir()
+    for split in ("train", "validation", "test"):
+        with pytest.raises(ValueError, match=rf"shop_exit: no recording in .*{split}/"):
+            run_goller(dataclasses.replace(config, handover=None), opened, tmp_path)
+        (shop / split / f"shop_exit-sp_st-{split}-0.zarr").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate benchmark=shop_handover`"):
+        run_goller(config, opened, tmp_path)
+    # Where none is named those beside the scenarios are taken, if there are any.
+    default = dataclasses.replace(config, handover=None)
+    with pytest.raises(AssertionError, match=r"grid\.zarr is opened"):
+        run_goller(default, opened, tmp_path)
+    assert _handover_paths(default) == []
+    there = tmp_path / "shop_handover" / "test" / "shop_handover-all-test-0.zarr"
+    there.mkdir(parents=True)
+    assert _handover_paths(default) == [str(there)]
+    assert _handover_paths(dataclasses.replace(config, handover=str(there))) == [str(there)]
+    assert _handover_paths(dataclasses.replace(config, handover=str(there.parents[1]))) == [str(there)]
 
 
 @pytest.mark.slow

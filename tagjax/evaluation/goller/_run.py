@@ -57,7 +57,7 @@ class GollerConfig:
 
     grid: str  # a recording
     scenarios: str  # a suite's folder with train/, validation/ and test/
-    handover: str | None = None  # a recording, or a suite's folder with test/
+    handover: str | None = None  # a recording, or a suite's folder with test/; shop_handover beside `scenarios` if None
     settings: GollerSettings = dataclasses.field(default_factory=GollerSettings)
     floor_dbm: float = -80.0
     fit_means: bool = False
@@ -80,6 +80,45 @@ def scenario_paths(folder: Path, split: str, most: int | None = None) -> list[tu
     return [(variant, path) for variant, _, path in sorted(found)]
 
 
+_SPLITS = ("train", "validation", "test")
+
+
+def _handover_paths(config: GollerConfig) -> list[str]:
+    """Recordings of a hand-over; none where the default folder has none."""
+    folder = Path(config.scenarios).parent / "shop_handover" if config.handover is None else Path(config.handover)
+    found = sorted(str(path) for path in (folder / "test").glob("*.zarr"))
+    if found or config.handover is None or (folder / "test").is_dir():
+        return found
+    return [config.handover] if _there(config.handover) else []
+
+
+def _there(recording: str) -> bool:
+    return "://" in recording or Path(recording).is_dir()
+
+
+def _check_paths(config: GollerConfig) -> None:
+    """Raises `ValueError` that names all that is missing of the recordings, and the commands that make them."""
+    told, home = [], "recordings/benchmark"
+    made = "`python -m experiments.simulate benchmark={0}` makes {1}/{0}"
+    if not _there(config.grid):
+        told.append(
+            f"grid={config.grid}: no such recording of a tag grid; {made.format('shop_grid', home)}/train/*.zarr."
+        )
+    folder = Path(config.scenarios)
+    if empty := [split for split in _SPLITS if not scenario_paths(folder, split, config.most)]:
+        told.append(
+            f"scenarios={folder}: no recording in {', '.join(f'{split}/' for split in empty)}; expected some in each of a "
+            f"suite's folders; {made.format('shop_exit', home)}."
+        )
+    if config.handover is not None and not _handover_paths(config):
+        told.append(
+            f"handover={config.handover}: no recording, and no folder with test/ of some; "
+            f"{made.format('shop_handover', home)}."
+        )
+    if told:
+        raise ValueError(" ".join(told))
+
+
 def run_goller(
     config: GollerConfig,
     open_recording: Callable[[str], Recording],
@@ -90,23 +129,22 @@ def run_goller(
     """Everything of the paper's evaluation on simulated recordings; returns what `metrics.json` holds.
 
     Widths and rates are fitted on the train split, thresholds chosen on train and validation, rates counted on test.
-    Raises `ValueError` where a split or the grid is missing.
+    Raises `ValueError`, before anything is observed, where the grid, a split or a hand-over that is asked for is missing.
     """
+    _check_paths(config)
     settings = config.settings
     grid = open_recording(config.grid)
     calibration = calibrate(grid, floor_dbm=config.floor_dbm, fit_means=config.fit_means)
     antenna_plot(folder / "antennas.png", grid_statistic(grid, find_site(grid)), calibration.location.antennas)
     start, num_frames = time.perf_counter(), 0
     splits: dict[str, list[Example]] = {}
-    for split in ("train", "validation", "test"):
+    for split in _SPLITS:
         splits[split] = []
         for variant, path in scenario_paths(Path(config.scenarios), split, config.most):
             recording = open_recording(str(path))
             splits[split].append((variant, observe(recording, settings), carried(recording)))
             num_frames += recording.num_frames
             on_done(recording.name)
-        if not splits[split]:
-            raise ValueError(f"{config.scenarios}/{split}: no recording. Simulate the suite: experiments.simulate.")
     seen_ms = 1e3 * (time.perf_counter() - start) / num_frames
     losses = np.zeros(0)
     if config.fit_steps:
@@ -184,12 +222,9 @@ def _handovers(
     folder: Path, config: GollerConfig, calibration: Calibration, open_recording: Callable[[str], Recording]
 ) -> dict[str, Any] | None:
     """Fig. 7 for every tag of the first recording, and what all recordings have in common; None without any."""
-    if config.handover is None:
-        return None
-    home = Path(config.handover) / "test"
-    paths = sorted(str(path) for path in home.glob("*.zarr")) if home.is_dir() else [config.handover]
+    paths = _handover_paths(config)
     if not paths:
-        raise ValueError(f"{home}: no recording of a hand-over. Simulate the suite: experiments.simulate.")
+        return None
     followed: list[Handover] = []
     for number, path in enumerate(paths):
         recording = open_recording(path)
