@@ -2,7 +2,8 @@
 
 python -m experiments.compare 'benchmark=[planar_tracks,ceiling_2]' most=2
 python -m experiments.compare benchmark=single_static 'only=[tagattention,tagattention_paper]'
-python -m experiments.compare 'benchmark=[shop_exit]' systems.goller_grid=<recording of shop_grid>
+python -m experiments.compare benchmark=shop_exit systems.goller_calibration=<calibration.json of experiments.goller>
+python -m experiments.compare benchmark=shop_exit systems.goller_grid=<recording of shop_grid>  # widths as they start
 """
 
 from __future__ import annotations

@@ -19,6 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.compare import suites_named, with_suites
+from tagjax.baselines.goller import (
+    AntennaModel,
+    Calibration,
+    GollerTracer,
+    make_association,
+    make_location,
+    save_calibration,
+)
 from tagjax.config import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
 from tagjax.evaluation.compare._run import _score, _Tally
@@ -67,7 +75,7 @@ def test_the_table_says_figures_reasons_and_what_the_papers_say():
     said = _printed(table)
     assert "(1) does not apply: the camera" in said
     assert "tagview's own paper, a: 0.97 of theirs" in said
-    assert "its settings for people: a" in said
+    assert "tagattention (people): a" in said
 
 
 def test_no_name_or_figure_is_cut_on_eighty_columns():
@@ -152,6 +160,28 @@ def test_false_alarms_are_claims_of_tags_that_lie_still_labelled_or_not(monkeypa
     _score(systems, "tagview", item, recording, scores, tally)
     assert np.mean(np.concatenate(tally.still)) == pytest.approx(3 / num)
     assert tally.scores.result()["false_claims"] == pytest.approx((3 + num) / (2 * num))
+
+
+def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """In place of the grid's, whose widths are as they start; a file that is none is refused before anything is made."""
+    num = 3
+    antennas = AntennaModel(jnp.zeros((num, 2)), jnp.zeros((num, 2)), jnp.zeros(num), jnp.zeros(num), jnp.zeros(()))
+    location, association = make_location(antennas), make_association(speed_m_s=0.123)
+    save_calibration(Calibration(location, association, jnp.asarray(0.4), jnp.asarray(-60.0)), tmp_path / "c.json")
+    config = _config(["shop_exit"])
+    settings = dataclasses.replace(config.systems, goller_calibration=str(tmp_path / "c.json"), goller_grid=None)
+    monkeypatch.setattr(GollerTracer, "at", lambda self, _: self)
+    recording = dataclasses.replace(synthetic.recording(4), antennas_m=np.zeros((num, 3)))
+    systems = Systems(settings, config.scores)
+    found = systems._goller(recording).calibration
+    np.testing.assert_allclose(found.association.log_speed_m_s, np.log(0.123), rtol=1e-5)
+    item = Item(from_mapping(Suite, config.suites["shop_exit"]), Variant("all"), "test", 0, 1)
+    assert systems.taken("goller", item) == "fitted widths"
+    assert Systems(config.systems, config.scores).taken("goller", item) == "starting widths"
+    wrong = dataclasses.replace(settings, goller_calibration=str(tmp_path / "none.json"))
+    with pytest.raises(ConfigError, match=r"systems\.goller_calibration: .*none\.json.*experiments\.goller"):
+        run_comparison(dataclasses.replace(config, systems=wrong, out=str(tmp_path / "made")), tmp_path / "out")
+    assert not (tmp_path / "made").exists()
 
 
 def test_what_cannot_be_compared_is_refused():

@@ -126,7 +126,7 @@ def _cell(
             break
     if not tally.num:
         return Cell(suite, system, reason=reason)
-    ways = sorted({way for item in items if (way := systems.chosen(system, item)) is not None})
+    ways = sorted({way for item in items if (way := systems.taken(system, item)) is not None})
     told = tally.scores.result()
     flat = [np.concatenate(parts) if parts else np.zeros(0) for parts in (tally.error_m, tally.still)]
     error_m, still = (part[np.isfinite(part)] for part in flat)
@@ -210,12 +210,12 @@ def console_table(cells: Iterable[Cell]) -> Table:
                 reasons.append(cell.reason)
             values = [f"({reasons.index(cell.reason) + 1})", *[""] * (len(MEASURES) - 1)]
         table.add_row(cell.suite, cell.system, *values)
-    ways: dict[str, list[str]] = {}
+    ways: dict[tuple[str, str], list[str]] = {}
     for cell in cells:
-        if cell.settings is not None and cell.suite not in (on := ways.setdefault(cell.settings, [])):
-            on.append(cell.suite)
+        if cell.settings is not None:
+            ways.setdefault((cell.system, cell.settings), []).append(cell.suite)
     below = [f"({number}) does not apply: {reason}" for number, reason in enumerate(reasons, 1)]
-    below += [f"TagAttention with its settings for {way}: {', '.join(suites)}" for way, suites in ways.items()]
+    below += [f"{system} ({way}): {', '.join(suites)}" for (system, way), suites in ways.items()]
     below += [f"{cell.system}'s own paper, {cell.suite}: {cell.paper}" for cell in cells if cell.paper is not None]
     table.caption = Text("\n".join([*below, *LEGEND]))
     table.caption_justify = "left"

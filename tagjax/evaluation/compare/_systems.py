@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...baselines._interface import host_trace
-from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate
+from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate, load_calibration
 from ...baselines.tagview import TagviewSettings, TagviewTracer
 from ...baselines.tagvision import PlaneCamera, TagVision, TagVisionSettings
 from ...config import ClipSettings, ConfigError
@@ -52,7 +52,8 @@ class SystemSettings:
     tagvision_calibration: CalibrationSettings = dataclasses.field(default_factory=CalibrationSettings)
     tagview: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
     goller: GollerSettings = dataclasses.field(default_factory=GollerSettings)
-    goller_grid: str | None = None  # recording of a tag at the places of a grid, which calibrates its antennas
+    goller_calibration: str | None = None  # calibration.json of experiments.goller, whose widths and rates are fitted
+    goller_grid: str | None = None  # else: recording of a tag on a grid, which calibrates its antennas and nothing more
 
     def __post_init__(self) -> None:
         if unknown := sorted(set(self.settings_of.values()) - set(self.tagattention)):
@@ -62,11 +63,19 @@ class SystemSettings:
 
 
 class Systems:
-    """Makes each system's traces of a recording; what cannot be applied raises `RecordingError` with the reason."""
+    """Makes each system's traces of a recording; what cannot be applied raises `RecordingError` with the reason.
+
+    Raises `ConfigError` where `goller_calibration` names none.
+    """
 
     def __init__(self, settings: SystemSettings, scores: ScoreSettings):
         self.settings, self.scores = settings, scores
         self._calibration: Calibration | None = None
+        if settings.goller_calibration is not None:
+            try:
+                self._calibration = load_calibration(Path(settings.goller_calibration))
+            except ValueError as error:
+                raise ConfigError(f"systems.goller_calibration: {error}") from error
         self._tracers: dict[tuple[str, str | None], AbstractTracer] = {}
 
     def chosen(self, name: str, item: Item) -> str | None:
@@ -83,6 +92,12 @@ class Systems:
                 f"it; they are {', '.join(self.settings.tagattention)}."
             )
         return self.settings.settings_of[story]
+
+    def taken(self, name: str, item: Item) -> str | None:
+        """Which of a system's settings a recording takes, to be told; None for a system that has one only."""
+        if name == "goller":
+            return "starting widths" if self.settings.goller_calibration is None else "fitted widths"
+        return self.chosen(name, item)
 
     def stride(self, name: str, item: Item) -> int:
         """Every how many pixels a system's masks have one."""
