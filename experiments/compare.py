@@ -1,6 +1,6 @@
 """All four systems on the same suites, in one table; the last line printed is the result as JSON.
 
-python -m experiments.compare 'benchmark=[planar_tracks,ceiling_2]' most=2
+python -m experiments.compare benchmark=planar_tracks,ceiling_2 most=2
 python -m experiments.compare benchmark=single_static 'only=[tagattention,tagattention_paper]'
 python -m experiments.compare benchmark=shop_exit systems.goller_calibration=<calibration.json of experiments.goller>
 python -m experiments.compare benchmark=shop_exit systems.goller_grid=<recording of shop_grid>  # widths as they start
@@ -55,10 +55,19 @@ def main(config: DictConfig) -> None:
 
 
 def with_suites(arguments: list[str]) -> list[str]:
-    """Arguments for Hydra, to which `benchmark=` would be one file of the group of that name."""
-    return [
-        f"suites={word.removeprefix('benchmark=')}" if word.startswith("benchmark=") else word for word in arguments
-    ]
+    """Arguments for Hydra, to which `benchmark=` would be one file of the group of that name.
+
+    Names with commas between them are a list, brackets or not, unless a sweep is asked for, which has a run for each.
+    """
+    sweeps = not {"-m", "--multirun"}.isdisjoint(arguments)
+    found = []
+    for word in arguments:
+        if word.startswith("benchmark="):
+            names = word.removeprefix("benchmark=")
+            bare = "," in names and not any(mark in names for mark in "[]()'\"")
+            word = f"suites=[{names}]" if bare and not sweeps else f"suites={names}"
+        found.append(word)
+    return found
 
 
 if __name__ == "__main__":

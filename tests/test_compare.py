@@ -189,6 +189,10 @@ def test_what_cannot_be_compared_is_refused():
         suites_named(["nowhere"])
     assert list(suites_named("occlusion")) == ["occlusion"]
     assert with_suites(["benchmark=[a,b]", "most=2"]) == ["suites=[a,b]", "most=2"]
+    assert with_suites(["benchmark=a,b", "only=[x,y]"]) == ["suites=[a,b]", "only=[x,y]"]
+    assert with_suites(["benchmark=a"]) == ["suites=a"]
+    assert with_suites(["-m", "benchmark=a,b"]) == ["-m", "suites=a,b"]  # a run for each
+    assert with_suites(["benchmark=choice(a,b)"]) == ["suites=choice(a,b)"]
     with pytest.raises(ConfigError, match="No suite"):
         _config([])
     for change, told in (({"only": ("magic",)}, "magic"), ({"split": "exam"}, "exam"), ({"most": 0}, "most")):
