@@ -54,7 +54,7 @@ def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[
     """The tracer with learned parameters in place of its own.
 
     `source` is a file of `save_parameters`, the name of packaged parameters, or `default`: those that were learned from
-    these very `settings`. Raises `ValueError` where there are none, for a file that is damaged, foreign, or of
+    these very `settings` (of several packaged ones all but one say `"default": false`, and are given by name). Raises `ValueError` where there are none, for a file that is damaged, foreign, or of
     another tracer, and where `settings` ask for other initial values than it was learned from.
     """
     path = _default_for(settings) if str(source) == "default" else _find(source)
@@ -94,7 +94,8 @@ def _find(source: str | Path) -> Path:
 def _default_for(settings: Mapping[str, Any]) -> Path:
     for name in packaged_parameters():
         path = PACKAGED / f"{name}.json"
-        if _read(path)["settings"] == dict(settings):
+        content = _read(path)
+        if content.get("default", True) and content["settings"] == dict(settings):
             return path
     there = ", ".join(packaged_parameters()) or "none"
     raise ValueError(

@@ -104,13 +104,16 @@ def test_a_tracer_without_learned_parameters_says_so() -> None:
         make_tracer({"_target_": "tagjax.tagattention_paper.TagAttentionPaper"}, "default")
 
 
-@pytest.mark.parametrize("name", packaged_parameters())
-def test_packaged_parameters_are_the_default_of_their_configuration(name: str) -> None:
+def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:
     with initialize_config_dir(str((Path(__file__).parents[1] / "conf").resolve()), version_base="1.3"):
-        composed = OmegaConf.to_container(compose("train", [f"tracer={name}"]), resolve=True)
+        composed = OmegaConf.to_container(compose("train", ["tracer=tagattention"]), resolve=True)
     assert isinstance(composed, dict)
-    tracer = make_tracer(composed["tracer"], "default")
-    untrained = make_tracer(composed["tracer"])
-    assert isinstance(tracer, TagAttention)
-    assert isinstance(untrained, TagAttention)
-    assert tracer.physical() != untrained.physical()
+    assert packaged_parameters() == ("tagattention", "things_in_hand")
+    untrained, default, people, things = (
+        make_tracer(composed["tracer"], weights) for weights in (None, "default", *packaged_parameters())
+    )
+    assert all(isinstance(one, TagAttention) for one in (untrained, default, people, things))
+    told = [one.physical() for one in (untrained, default, things) if isinstance(one, TagAttention)]
+    assert told[0] != told[1] != told[2] != told[0]
+    assert isinstance(people, TagAttention)
+    assert people.physical() == told[1]
