@@ -18,6 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from .errors import in_a_line
+from .help import answer_help
 from .train import CONFIGS, resolved
 
 
@@ -59,5 +60,6 @@ def with_cases(arguments: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "benchmark")
     sys.argv[1:] = with_cases(sys.argv[1:])
     main()

@@ -19,6 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from .errors import in_a_line
+from .help import answer_help
 from .train import CONFIGS, resolved
 
 
@@ -71,5 +72,6 @@ def with_suites(arguments: list[str]) -> list[str]:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "compare")
     sys.argv[1:] = with_suites(sys.argv[1:])
     main()

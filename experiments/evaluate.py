@@ -16,6 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from .errors import in_a_line
+from .help import answer_help
 from .train import CONFIGS, resolved
 
 
@@ -52,4 +53,5 @@ def main(config: DictConfig) -> float:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "evaluate")
     main()

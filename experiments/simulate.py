@@ -12,6 +12,7 @@ import hydra
 from omegaconf import DictConfig
 
 from .errors import in_a_line
+from .help import answer_help
 from .train import CONFIGS, resolved
 
 
@@ -61,4 +62,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "simulate")
     main()

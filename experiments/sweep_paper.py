@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from .compare import suites_named
 from .errors import in_a_line
+from .help import answer_help
 from .train import CONFIGS, resolved
 
 
@@ -54,4 +55,5 @@ def main(config: DictConfig) -> float:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "sweep_paper")
     main()

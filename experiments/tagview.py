@@ -17,6 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from .errors import in_a_line
+from .help import answer_help
 from .train import CONFIGS, resolved
 
 
@@ -64,4 +65,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "tagview")
     main()

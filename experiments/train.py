@@ -17,6 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from .errors import in_a_line
+from .help import answer_help
 from .run_folder import keep_configuration
 
 CONFIGS = str(Path(__file__).resolve().parents[1] / "conf")
@@ -70,4 +71,5 @@ def main(config: DictConfig) -> float:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "train")
     main()

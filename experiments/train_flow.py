@@ -14,6 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from .errors import in_a_line
+from .help import answer_help
 from .run_folder import keep_configuration
 from .train import CONFIGS, resolved
 
@@ -35,4 +36,5 @@ def main(config: DictConfig) -> float:
 
 
 if __name__ == "__main__":
+    answer_help(__doc__, "train_flow")
     main()
