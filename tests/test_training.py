@@ -7,8 +7,10 @@ import json
 import os
 import shutil
 import signal
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -17,6 +19,7 @@ import numpy as np
 import optax
 import pytest
 import synthetic_clips as synthetic
+from jaxtyping import Array, Int32
 
 from tagjax.recording import RecordingError
 from tagjax.training.checkpoint import CheckpointError, Checkpoints
@@ -352,6 +355,46 @@ def test_steps_before_samples_that_cannot_be_read_are_kept(tmp_path: Path) -> No
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
     lines = [(tmp_path / name / "metrics.jsonl").read_text() for name in ("straight", "broken")]
     assert lines[0] == lines[1]
+
+
+class _Counted(eqx.Module):
+    """A training state of next to nothing."""
+
+    step: Int32[Array, ""]
+
+
+def _count(folder: Path, num_steps: int, bad: AbstractSet[int] = frozenset(), **more: Any):
+    """A run whose steps do nothing but count; the `bad` ones are skipped."""
+
+    def update(state: _Counted, clips: Sequence[Any]) -> tuple[_Counted, dict[str, float]]:
+        step = int(state.step) + 1
+        return _Counted(state.step + 1), {"loss": float(step), "skipped": float(step in bad)}
+
+    settings = {"checkpoint_every": 100, "validate_every": 100, "progress": False} | more.pop("settings", {})
+    with Checkpoints(folder / "checkpoints") as checkpoints:
+        trained = train(
+            _Counted(jnp.zeros((), jnp.int32)),
+            synthetic.ClipCycle([synthetic.recording(20)]),
+            update=update,
+            settings=LoopSettings(num_steps, **settings),
+            logger=Logger(folder, LoggerSettings(mode="disabled")),
+            checkpoints=checkpoints,
+            **more,
+        )
+        return trained, checkpoints.steps()
+
+
+def test_a_scheduler_s_sigterm_saves_and_ends_the_run(tmp_path: Path) -> None:
+    def after_step(state: _Counted) -> None:
+        if int(state.step) == 2:
+            for _ in range(2):  # a scheduler may send it twice
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    trained, steps = _count(tmp_path, 6, after_step=after_step)
+    assert trained.interrupted
+    assert steps == [2]
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
 def test_a_run_that_diverges_stops_and_names_the_last_good_checkpoint(tmp_path: Path) -> None:

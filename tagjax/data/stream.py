@@ -8,12 +8,16 @@ import multiprocessing.connection
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 import grain
 import jax
 from absl import flags
+
+_LAST_STEP_S = 60.0
+"""A worker that got SIGTERM gives samples for so long."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,12 +89,20 @@ class StreamIterator:
 
 
 def _begin_worker(index: int, count: int) -> None:
-    """Workers compute on the host, leave Ctrl-C to the training process, and do not outlive it, however it ends."""
+    """Workers compute on the host, leave Ctrl-C to the training process, and do not outlive it, however it ends.
+
+    A scheduler sends SIGTERM to all processes: the step in progress still needs its samples.
+    """
     del index, count
     jax.config.update("jax_platforms", "cpu")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, frame: threading.Thread(target=leave, daemon=True).start())
     parent = multiprocessing.parent_process()
     assert parent is not None
+
+    def leave() -> None:
+        time.sleep(_LAST_STEP_S)
+        os._exit(1)
 
     def follow() -> None:
         multiprocessing.connection.wait([parent.sentinel])

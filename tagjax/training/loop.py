@@ -70,22 +70,27 @@ class Trained(Generic[StateT]):
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C into a flag, so that the step in progress ends; a second Ctrl-C stops at once."""
+    """Turns Ctrl-C and SIGTERM into a flag, so that the step in progress ends; a second Ctrl-C stops at once.
+
+    SIGTERM is what a scheduler sends before it kills, maybe more than once: it never stops at once.
+    """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked.is_set
         return
 
     def handler(number: int, frame: Any) -> None:
-        if asked.is_set():
+        if asked.is_set() and number == signal.SIGINT:
             raise KeyboardInterrupt
         asked.set()
 
-    before = signal.signal(signal.SIGINT, handler)
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield asked.is_set
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, earlier in before.items():
+            # None is one that Python did not set (JAX's runtime of several processes): it cannot be put back.
+            signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
 
 
 def resumed(state: StateT, samples: DataIterator, checkpoints: Checkpoints, *, allowed: bool) -> StateT:
@@ -116,7 +121,7 @@ def train(
     after_step: Callable[[StateT], None] | None = None,
     shown: Sequence[str] = ("loss", "own_coherence"),
 ) -> Trained[StateT]:
-    """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C or the samples end it.
+    """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C, SIGTERM or the samples end it.
 
     `update` does one step on this process's share of `batch_size` samples and gives numbers to log, which are the same
     in all processes; `shown` names those beside the progress bar. `validate` gives numbers that are logged under
