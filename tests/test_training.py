@@ -426,6 +426,18 @@ def test_a_run_that_diverges_stops_and_names_the_last_good_checkpoint(tmp_path: 
         LoopSettings(stop_after_skipped=0)
 
 
+def test_skipped_steps_do_not_push_the_last_good_checkpoint_out(tmp_path: Path) -> None:
+    settings = {"checkpoint_every": 1, "stop_after_skipped": 5}
+    with pytest.raises(DivergedError, match=r"up to step 9; the last good checkpoint is step 4 in .*Go on from there"):
+        _count(tmp_path / "late", 20, {2, *range(5, 20)}, settings=settings)
+    with Checkpoints(tmp_path / "late" / "checkpoints") as checkpoints:
+        assert checkpoints.steps() == [1, 3, 4]
+    with pytest.raises(DivergedError, match=r"no checkpoint was written before them in .*Start again with"):
+        _count(tmp_path / "early", 20, set(range(20)), settings=settings)
+    # A run's end is kept also after a skipped step: it has no other.
+    assert _count(tmp_path / "end", 4, {3, 4}, settings=settings)[1] == [1, 2, 4]
+
+
 def test_metrics_of_steps_done_again_are_dropped(tmp_path: Path) -> None:
     logger = Logger(tmp_path, LoggerSettings(mode="disabled"))
     for step in (1, 2, 3):

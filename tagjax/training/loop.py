@@ -127,8 +127,8 @@ def train(
     in all processes; `shown` names those beside the progress bar. `validate` gives numbers that are logged under
     `validation/`; `after_step` is called after every step.
 
-    A step whose `skipped` is 1 changed nothing. Raises `DivergedError` after `stop_after_skipped` of them in a row; it
-    names the last checkpoint written before the first of them.
+    A step whose `skipped` is 1 changed nothing, and no checkpoint is due after it. Raises `DivergedError` after
+    `stop_after_skipped` of them in a row; it names the last checkpoint written before the first of them.
     """
     columns = (
         TextColumn("[bold]train"),
@@ -166,7 +166,8 @@ def train(
             if validate is not None and (done % settings.validate_every == 0 or done == settings.num_steps):
                 found = {f"validation/{name}": value for name, value in validate(state).items()}
                 logger.write(done, found)
-            if done % settings.checkpoint_every == 0 or done == settings.num_steps:
+            # While steps are skipped none is written: those kept would push the last good one out.
+            if (done % settings.checkpoint_every == 0 and not skipped) or done == settings.num_steps:
                 checkpoints.save(state, samples.get_state())
             if after_step is not None:
                 after_step(state)
@@ -181,8 +182,12 @@ def train(
 
 def _diverged(checkpoints: Checkpoints, done: int, skipped: int) -> str:
     good = [step for step in checkpoints.steps() if step <= done - skipped]
-    there = f"the last good checkpoint is step {good[-1]} in {checkpoints.folder}" if good else "no checkpoint is good"
+    there = (
+        f"the last good checkpoint is step {good[-1]} in {checkpoints.folder}. Go on from there"
+        if good
+        else f"no checkpoint was written before them in {checkpoints.folder}. Start again"
+    )
     return (
-        f"The loss or its gradient was not finite in {skipped} steps in a row, up to step {done}; {there}. Go on from there "
+        f"The loss or its gradient was not finite in {skipped} steps in a row, up to step {done}; {there} "
         "with a smaller learning rate or clip_norm, and look at the data of these steps."
     )
