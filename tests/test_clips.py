@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,9 +13,10 @@ import pytest
 import synthetic_clips as synthetic
 
 from tagjax._numerics import SPEED_OF_LIGHT_M_S
+from tagjax.config import ConfigError, DataSettings, VirtualTagSettings
 from tagjax.data.clips import choose_antennas, clip_dataset, load_clip
-from tagjax.recording import Recording, RecordingError, RecordingWarning
-from tagjax.training.sources import join_reads
+from tagjax.recording import Recording, RecordingError, RecordingWarning, TagReads
+from tagjax.training.sources import join_reads, training_recordings
 
 ANTENNAS_M = np.array([[0.0, 0.0, 0.0], [0.5, -0.3, 4.0], [9.0, 9.0, 9.0]])
 SMALL = {"stride": 2, "flow": "dis_ultrafast"}
@@ -194,3 +196,47 @@ def test_clips_that_threads_load_at_once_are_those_of_one_after_the_other():
     for start, found in zip(starts, at_once, strict=True):
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(load(start)), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_recordings_of_which_no_clip_can_be_loaded_are_refused_at_once(recording: Recording) -> None:
+    make = lambda *recordings, **more: clip_dataset(recordings, clip_length=6, seed=0, **SMALL, **more)  # noqa: E731
+    unread = dataclasses.replace(recording, name="unread", reads=TagReads.empty())
+    with pytest.raises(RecordingError, match="unread holds no tag read"):
+        make(recording, unread)
+    with pytest.raises(RecordingError, match=r"synthetic: EPC 'tag-z' was never read.*tag-a, tag-b"):
+        make(recording, epcs=["tag-a", "tag-z"])
+    with pytest.raises(RecordingError, match="antennas 4 asked for"):
+        make(recording, antennas=(4,))
+    with pytest.raises(RecordingError, match="needs the true range of tag-a"):
+        make(recording, dataclasses.replace(recording, truth=None), estimator="truth")
+
+
+def test_recordings_shorter_than_a_clip_are_named(recording: Recording) -> None:
+    short = dataclasses.replace(synthetic.recording(4), name="short")
+    with pytest.warns(RecordingWarning, match="short has 4 frames, fewer than a clip's 6: it gives no clip"):
+        clip_dataset([recording, short], clip_length=6, seed=0, **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"validation": ("held_out.zarr",)}, r"data\.validation names held_out\.zarr, but data\.recordings is empty"),
+        (
+            {"virtual_tag": VirtualTagSettings(tracks="tracks.csv")},
+            r"data\.virtual_tag is given, but data\.recordings is",
+        ),
+    ],
+)
+def test_settings_that_mean_nothing_without_recordings_are_refused(given: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        training_recordings(DataSettings(**given))
+
+
+def test_a_recording_is_not_held_out_from_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link.zarr").symlink_to(tmp_path / "a.zarr")
+    for other in ("a.zarr/", "./b/../a.zarr", str(tmp_path / "a.zarr"), "link.zarr"):
+        with pytest.raises(RecordingError, match=r"a\.zarr: named both for training and for validation"):
+            training_recordings(DataSettings(recordings=("a.zarr",), validation=(other,)))
+    with pytest.raises(RecordingError, match="no such folder"):
+        training_recordings(DataSettings(recordings=("a.zarr",), validation=("b.zarr",)))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import warnings
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import grain
@@ -95,6 +96,17 @@ def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antenna
     return chosen
 
 
+def _tags(recording: Recording, epcs: Sequence[str] | None) -> tuple[str, ...]:
+    """The tags to trace: all that were read if None. Raises `RecordingError` if there is none, or one was never read."""
+    try:
+        named = tuple(recording.resolve_epcs(epcs))
+    except RecordingError as error:
+        raise RecordingError(f"{recording.name}: {error}") from error
+    if not named:
+        raise RecordingError(f"{recording.name} holds no tag read: there is nothing to trace.")
+    return named
+
+
 def _thin_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
     """Every stride-th pixel; where it is missing, the nearest measured one of the cell that it stands for."""
     height, width = depth_m.shape[1:]
@@ -133,9 +145,7 @@ def load_clip(
     check_clip(stride=stride, window=window, max_reads=max_reads)
     if not 0 <= start < stop <= recording.num_frames:
         raise ValueError(f"Frames {start} to {stop} asked for; {recording.name} has {recording.num_frames}.")
-    named = tuple(recording.resolve_epcs(epcs))
-    if not named:
-        raise RecordingError(f"{recording.name} holds no tag read: there is nothing to trace.")
+    named = _tags(recording, epcs)
     chosen = choose_antennas(recording, named, antennas)
     intrinsics = recording.intrinsics.scaled(stride)
     depth = recording.depth_metres(slice(start, stop))
@@ -190,6 +200,19 @@ def load_clip(
 
 def _true_window(recording: Recording, epc: str, num_window: int, antenna: int) -> RadioWindow:
     """The true distances to the antenna, with next to no doubt; unknown ones are infinitely doubtful."""
+    range_m = _true_range_m(recording, epc, antenna)
+    frame = np.arange(recording.num_frames)
+    past = np.maximum(frame[:, None] + np.arange(1 - num_window, 1)[None], 0)
+    relative = range_m[past] - range_m[past[:, :1]]
+    known = np.isfinite(relative).all(axis=1, keepdims=True) & (frame > 0)[:, None]
+    std = np.where(np.arange(num_window) > 0, _TRUTH_STD_M, 0.0)[None]
+    return RadioWindow(
+        jnp.asarray(np.where(known, relative, 0.0), jnp.float32), jnp.asarray(np.where(known, std, np.inf), jnp.float32)
+    )
+
+
+def _true_range_m(recording: Recording, epc: str, antenna: int) -> np.ndarray:
+    """A tag's true distance at every frame. Raises `RecordingError` if it is not known, or to another antenna."""
     truth = recording.truth
     if antenna != 1:
         raise RecordingError(
@@ -201,24 +224,20 @@ def _true_window(recording: Recording, epc: str, num_window: int, antenna: int) 
         raise RecordingError(
             f"{recording.name}: estimator=truth needs the true range of {epc}; truth holds that of: {there or 'no tag'}."
         )
-    range_m = np.asarray(truth.tag_range_m[epc], np.float64)
-    frame = np.arange(recording.num_frames)
-    past = np.maximum(frame[:, None] + np.arange(1 - num_window, 1)[None], 0)
-    relative = range_m[past] - range_m[past[:, :1]]
-    known = np.isfinite(relative).all(axis=1, keepdims=True) & (frame > 0)[:, None]
-    std = np.where(np.arange(num_window) > 0, _TRUTH_STD_M, 0.0)[None]
-    return RadioWindow(
-        jnp.asarray(np.where(known, relative, 0.0), jnp.float32), jnp.asarray(np.where(known, std, np.inf), jnp.float32)
-    )
+    return np.asarray(truth.tag_range_m[epc], np.float64)
 
 
 _window_reads = jax.jit(window_reads, static_argnums=(2, 3))
 
 
 class _ClipSource:
-    """Every clip of `length` frames that starts on a multiple of `step`, as Grain's random access source."""
+    """Every clip of `length` frames that starts on a multiple of `step`, as Grain's random access source.
 
-    def __init__(self, recordings: Sequence[Recording], length: int, step: int, on_host: bool, **settings):
+    Warns (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for those of which no clip can be
+    loaded, which would else be found when the first one is drawn.
+    """
+
+    def __init__(self, recordings: Sequence[Recording], length: int, step: int, on_host: bool, **settings: Any):
         self._recordings, self._length, self._settings = list(recordings), length, settings
         self._on_host = on_host  # NumPy arrays, which one process can hand to another
         self._places = [
@@ -232,6 +251,20 @@ class _ClipSource:
                 f"No clip of {length} frames in {len(self._recordings)} recordings (the longest has {longest} frames). "
                 "Ask for shorter clips or give longer recordings."
             )
+        for recording in recordings:
+            if recording.num_frames < length:
+                warnings.warn(
+                    f"{recording.name} has {recording.num_frames} frames, fewer than a clip's {length}: it gives no clip. "
+                    "Ask for shorter clips to use it.",
+                    RecordingWarning,
+                    stacklevel=3,
+                )
+                continue
+            named = _tags(recording, settings["epcs"])
+            chosen = choose_antennas(recording, named, settings["antennas"])
+            if settings["estimator"] == "truth":
+                for epc, antenna in itertools.product(named, chosen):
+                    _true_range_m(recording, epc, antenna)
 
     def __len__(self) -> int:
         return len(self._places)
@@ -267,8 +300,9 @@ def clip_dataset(
 
     Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None).
     With `workers` as many processes load them, radio included, and this one only takes them to its device; `share`
-    (i, n) is every n-th clip from the i-th on. Raises `RecordingError` if no recording is as long as a clip, `ValueError`
-    for settings that no clip can have.
+    (i, n) is every n-th clip from the i-th on. Warns (`RecordingWarning`) of recordings shorter than a clip; raises
+    `RecordingError` if all are, and for an unknown EPC or antenna of any other; `ValueError` for settings that no clip
+    can have.
     """
     check_clip(stride=stride, window=window, max_reads=max_reads)
     for name, found in (("clip_length", clip_length), ("step", 1 if step is None else step)):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..config import ClipSettings, DataSettings, SimulateSettings, VirtualTagSettings
+from ..config import ClipSettings, ConfigError, DataSettings, SimulateSettings, VirtualTagSettings
 from ..data.clips import Clip, load_clip
 from ..data.picture_files import read_labels
 from ..data.store import open_recording, save_recording
@@ -35,9 +35,22 @@ def clip_loader(settings: ClipSettings, *, colour: bool = False) -> Callable[...
 def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recording]]:
     """Recordings to train on and held-out ones: those named, or simulated ones where none is named.
 
-    Raises `RecordingError` for recordings that cannot be used, or that are in both.
+    Raises `RecordingError` for recordings that cannot be used, or that are in both, and `ConfigError` for settings that
+    mean nothing without recordings.
     """
-    twice = set(data.recordings) & set(data.validation)
+    if not data.recordings:
+        if data.validation:
+            raise ConfigError(
+                f"data.validation names {', '.join(data.validation)}, but data.recordings is empty: simulated recordings "
+                "would be trained and validated on. Name recordings to train on, or neither."
+            )
+        if data.virtual_tag != VirtualTagSettings():
+            raise ConfigError(
+                "data.virtual_tag is given, but data.recordings is empty; simulated recordings have tags of their own. "
+                "Name the recordings that the virtual tags are put on."
+            )
+    held_out = {_place(path) for path in data.validation}
+    twice = [path for path in data.recordings if _place(path) in held_out]
     if twice:
         raise RecordingError(f"{', '.join(sorted(twice))}: named both for training and for validation; hold it out.")
     if not data.recordings:
@@ -47,6 +60,11 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
         [with_virtual_tags(open_recording(path), tag) for path in paths] for paths in (data.recordings, data.validation)
     )
     return training, validation
+
+
+def _place(path: str) -> str:
+    """One name for a folder, however its path is written; addresses as they are."""
+    return path if "://" in path else str(Path(path).resolve())
 
 
 def simulated_recordings(settings: SimulateSettings) -> tuple[list[Recording], list[Recording]]:
