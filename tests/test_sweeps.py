@@ -11,7 +11,9 @@ import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -265,3 +267,80 @@ def test_wandb_offline_holds_curves_and_overlays(tmp_path: Path, monkeypatch: py
         stored, waited = next(iter(run.glob("*.wandb"))).read_bytes(), waited + 1
     assert [word for word in words if word not in stored] == []
     assert json.loads((tmp_path / "metrics.jsonl").read_text()) == {"step": 1, "loss": 0.5}
+
+
+def _wandb_that(monkeypatch: pytest.MonkeyPatch, init: Callable[..., Any]) -> None:
+    import wandb
+
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
+    monkeypatch.setattr(wandb, "init", init)
+
+
+class _Broken:
+    """A wandb run whose server has gone."""
+
+    def __init__(self, **asked: Any):
+        self.asked = asked
+        self.summary: dict[str, float] = {}
+
+    def log(self, *given: Any, **named: Any) -> None:
+        raise RuntimeError("the service has gone\nat length")
+
+    def finish(self) -> None:
+        raise BrokenPipeError("no service")
+
+
+def test_wandb_out_of_reach_or_lost_ends_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from wandb.errors import CommError
+
+    def init(**asked: Any) -> _Broken:
+        if asked["mode"] == "online":
+            raise CommError("Run initialization has timed out after 90.0 sec.")
+        return _Broken(**asked)
+
+    _wandb_that(monkeypatch, init)
+    with pytest.warns(UserWarning, match=r"cannot be reached: CommError: Run init.* 90\.0 sec\. Logging offline"):
+        logger = Logger(tmp_path, LoggerSettings(mode="online"))
+    with pytest.warns(
+        UserWarning, match=r"did not take a step's numbers: RuntimeError: the service has gone\. The run"
+    ):
+        logger.write(1, {"loss": 0.5})
+    picture = tmp_path / "report" / "curves" / "a.png"
+    picture.parent.mkdir(parents=True)
+    cv2.imwrite(str(picture), np.full((8, 8, 3), 90, np.uint8))
+    with pytest.warns(UserWarning, match="did not take the report"):
+        logger.report(tmp_path / "report", {"iou": 0.25}, tracer="learned")
+    with pytest.warns(UserWarning, match="did not take the end of the run: BrokenPipeError: no service"):
+        logger.close()
+    assert json.loads((tmp_path / "metrics.jsonl").read_text()) == {"step": 1, "loss": 0.5}
+
+    def never(**asked: Any) -> None:
+        raise PermissionError("read-only")
+
+    _wandb_that(monkeypatch, never)
+    with pytest.warns(UserWarning, match=r"does not begin: PermissionError: read-only\. Only metrics\.jsonl"):
+        Logger(tmp_path, LoggerSettings(mode="offline")).write(2, {"loss": 0.25})
+
+
+def test_a_resumed_run_stays_one_wandb_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+    _wandb_that(monkeypatch, lambda **given: asked.append(given))
+    for mode, resume_step in (("online", 0), ("online", 4), ("offline", 8), ("online", 0)):
+        Logger(tmp_path, LoggerSettings(mode=mode), resume_step=resume_step)
+    ids = [one["id"] for one in asked]
+    assert ids[0] == ids[1] == ids[2] != ids[3]  # the last begins anew
+    assert [one["resume"] for one in asked] == ["allow", "allow", None, "allow"]
+
+
+def test_an_unreachable_wandb_server_gives_an_offline_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    for name, value in (("API_KEY", "0" * 40), ("BASE_URL", "http://127.0.0.1:9"), ("INIT_TIMEOUT", "2")):
+        monkeypatch.setenv(f"WANDB_{name}", value)
+    with pytest.warns(UserWarning, match="Weights & Biases cannot be reached: .* Logging offline") as told:
+        logger = Logger(tmp_path, LoggerSettings(mode="online"))
+    assert len([one for one in told if "Weights & Biases" in str(one.message)]) == 1
+    logger.write(1, {"loss": 0.5})
+    logger.close()
+    named = (tmp_path / "wandb_id").read_text().strip()
+    assert [path.name.rpartition("-")[2] for path in (tmp_path / "wandb").glob("offline-run-*")] == [named]
