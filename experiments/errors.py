@@ -20,15 +20,16 @@ def in_a_line(command: str, *more: type[Exception]) -> Iterator[None]:
     try:
         yield
     except (ValueError, FileNotFoundError, *more) as error:
-        if os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0") or _sweeping():
+        if os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0") or sweeping():
             raise
         raise SystemExit(f"{command}: {error}") from error
     except KeyboardInterrupt:
-        if _sweeping():
+        if sweeping():
             raise
         print(f"\n{command}: interrupted.", flush=True)
         raise SystemExit(130) from None
 
 
-def _sweeping() -> bool:
+def sweeping() -> bool:
+    """Whether this is a job of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN

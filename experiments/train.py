@@ -8,7 +8,6 @@ python -m experiments.train -m search=optuna                          # started 
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from .errors import in_a_line
 from .help import answer_help
 from .run_folder import keep_configuration
+from .search import told, trials_left
 
 CONFIGS = str(Path(__file__).resolve().parents[1] / "conf")
 
@@ -30,32 +30,11 @@ def resolved(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items() if key != "num_trials"}  # which is the sweep's
 
 
-def trials_left(wanted: int, storage: str, study: str, folder: str) -> int:
-    """How many trials an Optuna study still lacks: a sweep that was killed does these when it is started again.
-
-    Only trials that were finished count; one that was killed stays among them as running, and is tried no more.
-    `folder` is the sweep's, in which Hydra writes the best trial also where none is left to do.
-    """
-    import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
-
-    optuna.logging.set_verbosity(logging.WARNING)
-    if storage.startswith("sqlite:///"):
-        Path(storage.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
-    known = {one.study_name for one in optuna.get_all_study_summaries(storage)}
-    if study not in known:
-        return wanted
-    trials = optuna.load_study(study_name=study, storage=storage).trials
-    left = max(0, wanted - sum(trial.state is optuna.trial.TrialState.COMPLETE for trial in trials))
-    if not left:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    return left
-
-
 OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
 
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train")
-def main(config: DictConfig) -> float:
+def main(config: DictConfig) -> float | None:
     from tagjax.config import TrainConfig, from_mapping
     from tagjax.training.loop import DivergedError
     from tagjax.training.run import run_training
@@ -65,7 +44,7 @@ def main(config: DictConfig) -> float:
     with in_a_line("train", DivergedError):
         checked = from_mapping(TrainConfig, values)
         keep_configuration(folder, values)
-        score = run_training(checked, folder)
+        score = told(run_training(checked, folder), folder, checked.loop.num_steps)
     print(f"run folder: {folder}")
     return score
 

@@ -16,11 +16,12 @@ from omegaconf import DictConfig
 from .errors import in_a_line
 from .help import answer_help
 from .run_folder import keep_configuration
+from .search import told
 from .train import CONFIGS, resolved
 
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train_flow")
-def main(config: DictConfig) -> float:
+def main(config: DictConfig) -> float | None:
     from tagjax.config import TrainFlowConfig, from_mapping
     from tagjax.training.flow_run import run_flow_training
     from tagjax.training.loop import DivergedError
@@ -30,7 +31,7 @@ def main(config: DictConfig) -> float:
     with in_a_line("train_flow", DivergedError):
         checked = from_mapping(TrainFlowConfig, values)
         keep_configuration(folder, values)
-        score = run_flow_training(checked, folder)
+        score = told(run_flow_training(checked, folder), folder, checked.loop.num_steps)
     print(f"run folder: {folder}")
     return score
 

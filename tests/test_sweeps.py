@@ -140,7 +140,7 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
 def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
     import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
 
-    from experiments.train import trials_left
+    from experiments.search import trials_left
 
     storage, folder = f"sqlite:///{tmp_path / 'new' / 'optuna.db'}", tmp_path / "sweep"
     assert trials_left(3, storage, "one", str(folder)) == 3
@@ -153,6 +153,83 @@ def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
     assert not folder.exists()
     assert trials_left(1, storage, "one", str(folder)) == 0
     assert folder.is_dir()
+
+
+OBJECTIVE = """
+import os
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+
+from experiments.search import told
+from experiments.train import CONFIGS
+
+
+@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train")
+def main(config):
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    value = folder / "value"  # a run that is gone on with keeps its own
+    if not value.exists():
+        value.write_text(str(config.optimizer.learning_rate))
+    ended = os.environ.get("ENDED")
+    if ended == "stopped":
+        (folder / "checkpoints" / "2").mkdir(parents=True)
+    return told(float("nan") if ended else float(value.read_text()), folder, 4)
+
+
+main()
+"""
+
+
+def _sweep_objective(folder: Path, *more: str, ended: str = "") -> subprocess.CompletedProcess[str]:
+    script = folder / "objective.py"
+    script.write_text(OBJECTIVE)
+    command = [sys.executable, str(script), "-m", f"hydra.sweep.dir={folder / 'sweep'}", *more]
+    environment = {**_environment(), "ENDED": ended}
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    "launcher",
+    [[], pytest.param(LAUNCHERS[1].values[0], marks=pytest.mark.slow)],
+    ids=["basic", "joblib"],
+)
+@_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
+def test_a_search_s_trials_have_folders_of_their_own_and_may_fail(tmp_path: Path, launcher: list[str]) -> None:
+    storage = tmp_path / "optuna.db"
+    search = ["search=optuna", f"hydra.sweeper.storage=sqlite:///{storage}", *launcher]
+    assert _sweep_objective(tmp_path, *search, "num_trials=1").returncode == 0
+    failed = _sweep_objective(tmp_path, *search, "num_trials=2", ended="nan")
+    assert failed.returncode == 0, failed.stderr[-2000:]
+    assert _sweep_objective(tmp_path, *search, "num_trials=3").returncode == 0
+    assert [state for _, state in _states(storage)] == ["COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
+    with sqlite3.connect(storage) as base:
+        values = dict(base.execute("select trial_id, value from trial_values"))
+        query = "select trial_id, param_value from trial_params where param_name = 'optimizer.learning_rate'"
+        asked = dict(base.execute(query))
+    assert len(values) == 3
+    assert values == {number: asked[number] for number in values}
+    folders = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
+    assert sorted(path.name.rpartition("_")[2] for path in folders) == ["0", "0", "0", "1"]
+    assert len({path.name.rpartition("_")[0] for path in folders}) == 3  # one time for each launch
+
+
+def test_a_stopped_run_ends_its_sweep(tmp_path: Path) -> None:
+    stopped = _sweep_objective(tmp_path, "seed=0,1", ended="stopped")
+    assert "KeyboardInterrupt" in stopped.stderr
+    assert stopped.returncode not in (0, 1)
+    assert (tmp_path / "sweep" / "0" / "checkpoints" / "2").is_dir()
+    assert not (tmp_path / "sweep" / "1").exists()
+
+
+@_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
+def test_a_search_without_held_out_recordings_is_refused(tmp_path: Path) -> None:
+    storage = f"hydra.sweeper.storage=sqlite:///{tmp_path / 'optuna.db'}"
+    refused = _sweep_objective(tmp_path, "search=optuna", storage, "data.recordings=[a.zarr]")
+    assert refused.returncode == 1
+    assert refused.stderr.rstrip().endswith("Name held-out recordings: data.validation=[...].")
+    assert not (tmp_path / "sweep").exists()
 
 
 SUITE = {
@@ -334,7 +411,10 @@ def test_a_resumed_run_stays_one_wandb_run(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_an_unreachable_wandb_server_gives_an_offline_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import wandb
+
     monkeypatch.delenv("WANDB_MODE", raising=False)
+    wandb.teardown()  # what it knows of the environment is from an earlier run
     for name, value in (("API_KEY", "0" * 40), ("BASE_URL", "http://127.0.0.1:9"), ("INIT_TIMEOUT", "2")):
         monkeypatch.setenv(f"WANDB_{name}", value)
     with pytest.warns(UserWarning, match="Weights & Biases cannot be reached: .* Logging offline") as told:
@@ -342,5 +422,6 @@ def test_an_unreachable_wandb_server_gives_an_offline_run(tmp_path: Path, monkey
     assert len([one for one in told if "Weights & Biases" in str(one.message)]) == 1
     logger.write(1, {"loss": 0.5})
     logger.close()
+    wandb.teardown()
     named = (tmp_path / "wandb_id").read_text().strip()
     assert [path.name.rpartition("-")[2] for path in (tmp_path / "wandb").glob("offline-run-*")] == [named]
