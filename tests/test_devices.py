@@ -126,3 +126,14 @@ def test_one_device_leaves_everything_where_it_is():
 def test_processes_that_cannot_meet_are_refused(settings: dict, message: str):
     with pytest.raises(ValueError, match=message):
         DistributedSettings(**settings)
+
+
+def test_a_scheduler_that_is_not_there_is_named():
+    code = (
+        "from tagjax.training.processes import DistributedSettings, joined\n"
+        "with joined(DistributedSettings(automatic=True, timeout_s=5)): pass"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "distributed.automatic is true, but JAX finds no scheduler" in done.stderr
+    assert "give distributed.coordinator" in done.stderr

@@ -53,13 +53,21 @@ def joined(settings: DistributedSettings) -> Iterator[None]:
     """Within it all processes are one machine of many devices. To be entered before anything is computed.
 
     They part when all have come to the end. An error in one leaves the others without a partner: JAX's runtime ends
-    them, and the run goes on from its newest checkpoint when all are started again.
+    them, and the run goes on from its newest checkpoint when all are started again. Raises `ValueError` where the
+    scheduler was to be asked and there is none.
     """
     if not settings.automatic and settings.num_processes == 1:
         yield
         return
     if settings.automatic:
-        jax.distributed.initialize(initialization_timeout=settings.timeout_s)
+        try:
+            jax.distributed.initialize(initialization_timeout=settings.timeout_s)
+        except ValueError as error:
+            raise ValueError(
+                f"distributed.automatic is true, but JAX finds no scheduler that has started this process ({error}) "
+                "Expected Slurm, Open MPI or Kubernetes: start it by srun or mpirun, or give distributed.coordinator, "
+                "num_processes and process_id."
+            ) from error
     else:
         jax.distributed.initialize(
             settings.coordinator,
