@@ -82,6 +82,10 @@ class VirtualTagSettings:
     seeds: tuple[int, ...] = (0,)
     reader: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of the reader's settings
 
+    def __post_init__(self) -> None:
+        if not self.seeds:
+            raise ConfigError("seeds is empty; expected at least one: a reader and its noise are drawn for each.")
+
 
 @dataclasses.dataclass(frozen=True)
 class DataSettings:
@@ -289,7 +293,8 @@ def _convert_to_any(hints: Sequence[Any], value: Any, where: str) -> Any:
 def build(settings: Mapping[str, Any], *, where: str = "_target_") -> Any:
     """Call what `_target_` names with the other keys; nested mappings with a `_target_` are built first.
 
-    Raises `ConfigError` for a target outside this package and Optax, one that does not exist, or wrong arguments.
+    Raises `ConfigError` for a target outside this package and Optax, one that does not exist, or arguments that it does
+    not take.
     """
     target = settings.get("_target_")
     if not isinstance(target, str) or not target.startswith(TARGET_PREFIXES):
@@ -306,6 +311,8 @@ def build(settings: Mapping[str, Any], *, where: str = "_target_") -> Any:
         return called(**arguments)
     except TypeError as error:
         raise ConfigError(f"{where}: {target} does not take these settings: {error}.") from error
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from error
 
 
 def _resolve(target: str, where: str) -> Any:

@@ -21,6 +21,27 @@ _LOG, _LOGIT = "log_", "logit_"
 ModuleT = TypeVar("ModuleT", bound=eqx.Module)
 
 
+def check_positive(**values: float) -> None:
+    """Raise `ValueError`, by name, for a value that cannot be kept as its logarithm."""
+    for name, value in values.items():
+        if not value > 0:
+            raise ValueError(f"{name} is {value}; expected a positive value (it is kept as its logarithm).")
+
+
+def check_shares(**values: float) -> None:
+    """Raise `ValueError`, by name, for a value that is no share from 0 to 1."""
+    for name, value in values.items():
+        if not 0 <= value <= 1:
+            raise ValueError(f"{name} is {value}; expected a share from 0 to 1.")
+
+
+def check_whole(**values: int) -> None:
+    """Raise `ValueError`, by name, for what is no whole number of at least 1."""
+    for name, value in values.items():
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} is {value!r}; expected a whole number of at least 1.")
+
+
 def stored_log(value: float) -> Float[Array, ""]:
     """A positive value as it is stored. Raises `ValueError` for any other."""
     if value <= 0:
@@ -61,11 +82,11 @@ def with_physical(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
         if not isinstance(leaf, jax.Array):
             continue
         if name.startswith(_LOG):
+            check_positive(**{name.removeprefix(_LOG): values[name.removeprefix(_LOG)]})
             leaves[name] = stored_log(values[name.removeprefix(_LOG)])
         elif name.startswith(_LOGIT):
             share = values[name.removeprefix(_LOGIT)]
-            if not 0 <= share <= 1:
-                raise ValueError(f"{name.removeprefix(_LOGIT)} is {share}; expected a share from 0 to 1.")
+            check_shares(**{name.removeprefix(_LOGIT): share})
             leaves[name] = stored_logit(share)
         else:
             leaves[name] = jnp.asarray(values[name], jnp.float32)

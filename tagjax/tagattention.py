@@ -25,7 +25,7 @@ from .anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, upda
 from .attention import att_corr, att_rbf, attention, coherent_score, read_support
 from .background import Background, empty_background, is_background, remember, shows_rest
 from .motion import MotionMap, carry, empty_motion, push_gather
-from .parameters import physical, stored_log, stored_logit, with_physical
+from .parameters import check_positive, check_shares, check_whole, physical, stored_log, stored_logit, with_physical
 from .phase_memory import PhaseMemory, carry_phases, phase_evidence
 from .phases import PhaseNoise
 from .propagation import log_likelihood_ratio, propagate, radio_speed, rival_log_odds, soft_clip, velocity_gate
@@ -276,9 +276,60 @@ class TagAttention(AbstractSmoother):
             doubled_angle: take phases modulo pi in the coherent term (readers with pi flips).
             anchor_bins: number of ranges of 0.1 m that the anchor tells apart.
             cut_rule: "margin", or "cdf_corner" as in the paper.
+
+        Raises `ValueError`, by name, for a value that such a parameter cannot have.
         """
         if cut_rule not in ("margin", "cdf_corner"):
             raise ValueError(f"cut_rule is {cut_rule!r}; expected 'margin' or 'cdf_corner'.")
+        check_positive(
+            alpha_m2=alpha_m2,
+            floor=floor,
+            slack=slack,
+            noise_share=noise_share,
+            coherent_weight=coherent_weight,
+            phase_weight=phase_weight,
+            phase_slack=phase_slack,
+            phase_spread_rad=phase_spread_rad,
+            phase_rest_spread_rad=phase_rest_spread_rad,
+            v0_m_s=v0_m_s,
+            gate_width_m_s=gate_width_m_s,
+            memory_s=memory_s,
+            evidence_limit=evidence_limit,
+            segment_temperature=segment_temperature,
+            affinity_length=affinity_length,
+            affinity_speed_m_s=affinity_speed_m_s,
+            cut_width=cut_width,
+            cut_margin=cut_margin,
+            extent_m=extent_m,
+            prior_weight=prior_weight,
+            prior_reach=prior_reach,
+            anchor_weight=anchor_weight,
+            anchor_width_m=anchor_width_m,
+            anchor_depth_m=anchor_depth_m,
+            anchor_limit=anchor_limit,
+            anchor_drift_m=anchor_drift_m,
+            anchor_rate=anchor_rate,
+            foreground_weight=foreground_weight,
+            rivalry=rivalry,
+            max_speed_m_s=max_speed_m_s,
+            rest_nats=rest_nats,
+        )
+        check_shares(
+            beta=beta,
+            background=background,
+            profile=profile,
+            rest=rest,
+            phase_outlier=phase_outlier,
+            pool_motion=pool_motion,
+            pool_log_odds=pool_log_odds,
+            diffusion=diffusion,
+            cut_share=cut_share,
+            inertia=inertia,
+            size_rate=size_rate,
+            range_share=range_share,
+            box_tail=box_tail,
+        )
+        check_whole(cell=cell, anchor_bins=anchor_bins)
         self.log_alpha, self.logit_beta = stored_log(alpha_m2), stored_logit(beta)
         self.log_floor, self.logit_background = stored_log(floor), stored_logit(background)
         self.logit_profile, self.log_slack = stored_logit(profile), stored_log(slack)

@@ -9,11 +9,13 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .attention import att_corr, att_rbf, attention, centre_first
 from .image.warp import splat
 from .motion import MotionMap, empty_motion, push_splat
+from .parameters import check_positive, check_shares, check_whole
 from .propagation import log_likelihood_ratio, propagate, radio_speed, velocity_gate
 from .segmentation import cdf_cut, pool, segment, unpool
 from .tracer import AbstractTracer, Camera, Frame, Trace, describe
@@ -41,6 +43,16 @@ class TagAttentionPaper(AbstractTracer):
     softness: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.0)
     cell: int = eqx.field(static=True, default=8)
     refine: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self) -> None:
+        # What is being traced has no value yet.
+        told = {name: leaf for name, leaf in vars(self).items() if not isinstance(leaf, Tracer)}
+        check_positive(**{name: round(float(told[name]), 9) for name in told.keys() & {"alpha_m2"}})
+        check_shares(**{name: round(float(told[name]), 6) for name in told.keys() & {"beta", "forgetting"}})
+        for name in told.keys() & {"v0_m_s", "softness"}:
+            if not told[name] >= 0:
+                raise ValueError(f"{name} is {told[name]:g}; expected at least 0.")
+        check_whole(cell=self.cell)
 
     def init(self, camera: Camera, frame: Frame) -> PaperState:
         height, width = frame.depth_m.shape

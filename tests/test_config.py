@@ -52,6 +52,11 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"data": {"clips": {"window": 1}}}, r"data\.clips: window is 1; expected at least 2"),
         ({"data": {"clips": {"max_reads": 0}}}, r"data\.clips: max_reads is 0; expected at least 1"),
         ({"data": {"clips": {"length": 6, "window": 7}}}, r"length is 6; expected at least the window's 7"),
+        ({"data": {"virtual_tag": {"seeds": []}}}, r"data\.virtual_tag: seeds is empty; expected at least one"),
+        ({"scores": {"tags_at_once": 0}}, r"scores: tags_at_once is 0; expected at least 1"),
+        ({"scores": {"frames_at_once": -1}}, r"scores: frames_at_once is -1; expected at least 1"),
+        ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a share from 0 to 1"),
+        ({"scores": {"frames": [9, 3]}}, r"scores: frames is \[9, 3\]; expected \[from, to\]"),
     ],
 )
 def test_wrong_configuration_names_the_key(given: dict, message: str) -> None:
@@ -99,6 +104,22 @@ def test_targets_that_are_refused(target: str | None, message: str) -> None:
 def test_unknown_settings_of_a_target_are_refused() -> None:
     with pytest.raises(ConfigError, match="alhpa"):
         build({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
+
+
+@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention_paper.TagAttentionPaper"])
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cell": 0}, r"tracer: cell is 0; expected a whole number of at least 1"),
+        ({"cell": 4.5}, r"tracer: "),  # beartype is first here
+        ({"beta": 2.0}, r"tracer: beta is 2\.0; expected a share from 0 to 1"),
+        ({"alpha_m2": -1.0}, r"tracer: alpha_m2 is -1\.0; expected a positive value"),
+        ({"alpha_m2": float("nan")}, r"tracer: alpha_m2 is nan; expected a positive value"),
+    ],
+)
+def test_settings_that_no_tracer_can_have_are_named(tracer: str, settings: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build({"_target_": f"tagjax.{tracer}", **settings}, where="tracer")
 
 
 def _written(path: str) -> dict[str, Any]:

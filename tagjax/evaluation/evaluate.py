@@ -40,6 +40,18 @@ class ScoreSettings:
     smooth: bool = False  # say of a frame what those after it tell as well: twice the time, and not while it happens
     num_pictures: int = 12  # frames kept for overlay pictures, spread over the recording
 
+    def __post_init__(self) -> None:
+        least = {"tags_at_once": 1, "frames_at_once": 1, "lock_frames": 1, "num_pictures": 0, "min_pixels": 0}
+        least |= {"moved_for_s": 0, "min_speed_m_s": 0, "border_px": 0}
+        for name, lowest in least.items():
+            if not getattr(self, name) >= lowest:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected at least {lowest}.")
+        for name in ("threshold", "mask_level"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected a share from 0 to 1.")
+        if self.frames is not None and not 0 <= self.frames[0] < self.frames[1]:
+            raise ValueError(f"frames is {list(self.frames)}; expected [from, to] with 0 <= from < to.")
+
     def able(self, tracer: AbstractTracer) -> ScoreSettings:
         """These, without smoothing for a tracer that goes forwards only."""
         return dataclasses.replace(self, smooth=self.smooth and isinstance(tracer, AbstractSmoother))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..config import ClipSettings, ConfigError, DataSettings, SimulateSettings, VirtualTagSettings
+from ..config import ClipSettings, ConfigError, DataSettings, SimulateSettings, VirtualTagSettings, from_mapping
 from ..data.clips import Clip, load_clip
 from ..data.picture_files import read_labels
 from ..data.store import open_recording, save_recording
@@ -97,7 +97,7 @@ def _simulated(settings: SimulateSettings, seed: int) -> Recording:
 def with_virtual_tags(recording: Recording, settings: VirtualTagSettings) -> Recording:
     """The recording with a virtual tag on each tracked label, for each seed, read as if it were alone.
 
-    Unchanged if no tracks are given.
+    Unchanged if no tracks are given. Raises `ConfigError` for settings that a reader does not have.
     """
     if settings.tracks is None:
         return recording
@@ -107,7 +107,7 @@ def with_virtual_tags(recording: Recording, settings: VirtualTagSettings) -> Rec
     if settings.labels is not None:
         recording = dataclasses.replace(recording, truth=_labelled(recording, Path(settings.labels)))
     tracks = load_tracks_csv(settings.tracks, recording.frame_time_s())
-    reader = ReaderSettings(**settings.reader)
+    reader = from_mapping(ReaderSettings, settings.reader, where="virtual_tag.reader")
     tagged = [
         attach_virtual_tags(
             recording, {label: track}, reader, seed=seed, epc_of=lambda one, s=seed: f"label{one}-seed{s}"
