@@ -20,9 +20,11 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import ConfigError
+from tagjax.config import ConfigError, from_mapping
 from tagjax.evaluation.sweep import Line, SweepConfig, read_lines, run_sweep, said, table, write_sweep
+from tagjax.tagattention import TagAttention
 from tagjax.training.logging import Logger, LoggerSettings
+from tagjax.training.run import make_tracer
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -298,6 +300,28 @@ def test_a_table_weighs_frames_within_and_conditions_alike(tmp_path: Path) -> No
     many = {"v0_m_s": tuple(np.linspace(0, 1, 8).tolist())}
     write_sweep(tmp_path, _config(tmp_path, grid=many), [_line({"v0_m_s": v}, "a", v, 5) for v in many["v0_m_s"]])
     assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
+
+
+def test_whole_numbers_and_words_of_a_grid_stay_what_they_are(tmp_path: Path) -> None:
+    values = {"suites": {"tiny": SUITE}, "out": str(tmp_path)}
+    tracer = {"_target_": "tagjax.tagattention.TagAttention", "cell": 6, "cut_rule": "margin", "v0_m_s": 0.1}
+    tracer["doubled_angle"] = True
+    grid = {"cell": [4, 8], "cut_rule": ["margin", "cdf_corner"], "v0_m_s": [0.5], "doubled_angle": [False]}
+    config = from_mapping(SweepConfig, {**values, "tracer": tracer, "grid": grid})
+    first = config.points()[0]
+    assert [type(value) for value in first.values()] == [int, str, float, bool]
+    assert said(first) == "cell=4, cut_rule=margin, v0_m_s=0.5, doubled_angle=False"
+    for point in config.points():
+        assert isinstance(make_tracer({**config.tracer, **point}), TagAttention)
+    lines = [_line(point, "slow", 0.1 * number, 10) for number, point in enumerate(config.points())]
+    write_sweep(tmp_path, config, lines)
+    assert "| 8 | cdf_corner | 0.5 | False | 0.300 |" in (tmp_path / "table.md").read_text()
+    many = {"cell": (2, 3, 4, 5), "cut_rule": ("margin", "cdf_corner")}
+    config = _config(tmp_path, tracer=tracer, grid=many)
+    write_sweep(tmp_path, config, [_line(point, "slow", 0.1, 10) for point in config.points()])
+    assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
+    with pytest.raises(ConfigError, match="cell is 0; expected a whole number"):
+        run_sweep(_config(tmp_path, grid={"cell": (0,)}), tmp_path / "refused")  # before anything is simulated
 
 
 def test_lines_cut_short_are_taken_away(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from ..data.store import open_recording
 from ..sim.suites import SPLITS, Item, Suite, make_items
 from ..training.run import make_tracer
 from ..training.sources import clip_loader
-from ..viz.sweep import curve_panels, parameter_panels
+from ..viz.sweep import curve_panels, parameter_panels, worded
 from .evaluate import RecordingResult, ScoreSettings, evaluate_recording
 from .report import plain
 
@@ -32,6 +32,9 @@ _FEW = 6
 
 _LINES = "lines.jsonl"
 
+Value = int | float | str | bool
+"""Of a parameter: whole numbers and words stay what they are."""
+
 
 @dataclasses.dataclass(frozen=True)
 class SweepConfig:
@@ -39,7 +42,7 @@ class SweepConfig:
 
     suites: Mapping[str, Mapping[str, Any]]
     tracer: Mapping[str, Any]
-    grid: Mapping[str, tuple[float, ...]]  # values of the tracer's parameters; all combinations are tried
+    grid: Mapping[str, tuple[Value, ...]]  # values of the tracer's parameters; all combinations are tried
     clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
     out: str = "recordings/benchmark"
@@ -60,7 +63,7 @@ class SweepConfig:
             known = ", ".join(sorted(set(self.tracer) - {"_target_"}))
             raise ConfigError(f"grid: the tracer has no {', '.join(unknown)}; it has {known}.")
 
-    def points(self) -> list[dict[str, float]]:
+    def points(self) -> list[dict[str, Value]]:
         """Every combination of the grid's values."""
         return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
 
@@ -72,7 +75,7 @@ class Line:
     key: str  # of everything that the numbers follow from
     condition: str  # suite and variant
     recording: str
-    point: Mapping[str, float]
+    point: Mapping[str, Value]
     numbers: Mapping[str, float | int | None]
     iou: tuple[float | None, ...]  # by frame, mean over tags that show; no claim counts as 0
 
@@ -87,14 +90,14 @@ def run_sweep(
     """
     tell = on_progress or (lambda done, total, name: None)
     folder.mkdir(parents=True, exist_ok=True)
+    points = config.points()
+    tracers = [make_tracer({**config.tracer, **point}) for point in points]  # a wrong value is told before the work
     work = [
         (suite, item)
         for name, values in config.suites.items()
         for suite in [_suite(config, from_mapping(Suite, values, where=f"benchmark {name}"))]
         for item in _items(config, suite, lambda made: tell(0, 0, f"simulated {made}"))
     ]
-    points = config.points()
-    tracers = [make_tracer({**config.tracer, **point}) for point in points]
     known = {line.key: line for line in read_lines(folder / _LINES)}
     lines: list[Line] = []
     for suite, item in work:
@@ -152,7 +155,7 @@ def _remembered(clips: ClipSettings) -> Callable[..., Any]:
     return load
 
 
-def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, float]) -> str:
+def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, Value]) -> str:
     scene = {**dataclasses.asdict(suite), "counts": None}  # how many others there are changes nothing
     parts = [
         scene,
@@ -197,9 +200,9 @@ def read_lines(path: Path) -> list[Line]:
     return [Line(**{**row, "iou": tuple(row["iou"])}) for row in rows]
 
 
-def said(point: Mapping[str, float]) -> str:
+def said(point: Mapping[str, Value]) -> str:
     """A point of the grid in words."""
-    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+    return ", ".join(f"{name}={worded(value)}" for name, value in point.items())
 
 
 def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
@@ -232,7 +235,7 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
         writer = csv.DictWriter(file, heads)
         writer.writeheader()
         writer.writerows(rows)
-    cells = [[f"{row[head]:.4g}" if head in config.grid else f"{row[head]:.3f}" for head in heads] for row in rows]
+    cells = [[worded(row[head]) if head in config.grid else f"{row[head]:.3f}" for head in heads] for row in rows]
     text = [" | ".join(row) for row in (heads, ["---"] * len(heads), *cells)]
     (folder / "table.md").write_text("".join(f"| {row} |\n" for row in text), encoding="utf-8")
     points = config.points()

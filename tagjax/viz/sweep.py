@@ -11,6 +11,11 @@ from jaxtyping import Float
 from .figure import blank
 
 
+def worded(value: int | float | str | bool) -> str:
+    """A parameter's value as it is shown."""
+    return str(value) if isinstance(value, str | bool) else f"{value:.6g}"
+
+
 def curve_panels(path: Path, curves: Mapping[str, Mapping[str, Float[np.ndarray, " time"]]]) -> None:
     """Write a PNG with a panel for each condition: mean box IoU against frame number, one line a point."""
     columns = min(2, len(curves))
@@ -29,14 +34,15 @@ def curve_panels(path: Path, curves: Mapping[str, Mapping[str, Float[np.ndarray,
     figure.savefig(path, dpi=120)
 
 
-def parameter_panels(path: Path, best: Mapping[str, Mapping[float, float]]) -> None:
+def parameter_panels(path: Path, best: Mapping[str, Mapping[int | float | str | bool, float]]) -> None:
     """Write a PNG with a panel for each parameter: the best mean box IoU that each of its values allows."""
     figure = blank(3.6 * len(best), 3.2)
     panels = figure.subplots(1, len(best), sharey=True, squeeze=False)[0]
     for axes, (name, values) in zip(panels, best.items(), strict=True):
-        at = sorted(values)
+        words = any(isinstance(value, str) for value in values)
+        at = sorted(values, key=str if words else None)
         axes.plot(range(len(at)), [values[value] for value in at], "o-", linewidth=1.4)
-        axes.set_xticks(range(len(at)), [f"{value:g}" for value in at])
+        axes.set_xticks(range(len(at)), [worded(value) for value in at])
         axes.set(xlabel=name)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("best mean box IoU")
