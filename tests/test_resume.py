@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -19,6 +20,7 @@ import synthetic_clips as synthetic
 
 from tagjax.data.clips import clip_dataset
 from tagjax.data.store import save_recording
+from tagjax.data.stream import _begin_worker
 
 ROOT = Path(__file__).parents[1]
 NUM_STEPS = 16
@@ -147,6 +149,27 @@ def _clips(workers: int = 0, share: tuple[int, int] = (0, 1)):
             [held], clip_length=4, stride=4, step=1, seed=3, flow="dis_ultrafast", workers=workers, share=share
         )
     )
+
+
+def _worker(begun) -> None:
+    _begin_worker(0, 1)
+    begun.set()
+    time.sleep(60)
+
+
+def test_a_scheduler_s_sigterm_leaves_workers_time_for_the_last_step() -> None:
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    worker = context.Process(target=_worker, args=(begun,), daemon=True)
+    worker.start()
+    try:
+        assert begun.wait(120)
+        worker.terminate()
+        worker.join(1.0)
+        assert worker.is_alive()
+    finally:
+        worker.kill()
+        worker.join()
 
 
 def test_shares_of_a_stream_are_the_stream_and_places_are_common() -> None:
