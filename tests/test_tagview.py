@@ -66,6 +66,7 @@ def test_splicing_skips_reads_that_do_not_count():
     valid = jnp.asarray([True, False, True, True, False, False])
     np.testing.assert_allclose(_splice(phase, valid, 2 * np.pi), [0.1, 0.1, 0.4, 0.7, 0.7, 0.7], atol=1e-6)
     np.testing.assert_array_equal(_splice(phase, jnp.zeros(6, bool), 2 * np.pi), np.zeros(6))
+    assert _splice(jnp.zeros(0), jnp.zeros(0, bool), 2 * np.pi).shape == (0,)
 
 
 def test_splicing_has_the_identity_for_gradient(gradients_agree):

@@ -105,6 +105,34 @@ def test_score_of_nothing_is_nothing() -> None:
         assert np.all(np.isfinite(gradient))
 
 
+def test_what_does_not_count_may_be_anything() -> None:
+    residual, counted = jnp.asarray([0.0, 0.05, jnp.nan], jnp.float32), jnp.asarray([True, True, False])
+    for reference in ("first", "absolute"):
+        score = lambda r, c, by=reference: phase_score(r, c, sigma_rad=SIGMA, reference=by)  # noqa: E731
+        assert float(score(residual, counted)) == pytest.approx(float(score(residual[:2], counted[:2])), abs=1e-6)
+        gradient = np.asarray(jax.grad(score)(residual, counted))
+        np.testing.assert_allclose(gradient[:2], jax.grad(score)(residual[:2], counted[:2]), atol=1e-5)
+        assert gradient[2] == 0.0
+    known = Snapshots(residual, jnp.full(3, 9e8), jnp.ones((2, 3)), jnp.broadcast_to(counted, (2, 3)))
+    odd = Snapshots(residual, jnp.asarray([9e8, 9e8, jnp.nan]), jnp.ones((2, 3)).at[:, 2].set(jnp.nan), known.valid)
+    said = [match_scores(s, key=jax.random.key(0), num_rounds=2) for s in (known, odd)]
+    np.testing.assert_allclose(said[0], said[1], atol=1e-6)
+    assert said[0][0] > 0.5
+    slope = jax.grad(lambda s: jnp.sum(match_scores(odd, key=jax.random.key(0), num_rounds=2, hop_slope_rad_hz=s)))
+    assert np.isfinite(slope(jnp.zeros(())))
+
+
+def test_no_snapshots_and_no_candidates_are_defined() -> None:
+    for reference in ("first", "absolute"):
+        assert float(phase_score(jnp.zeros(0), jnp.zeros(0, bool), sigma_rad=SIGMA, reference=reference)) == 0.0
+    assert jax.grad(lambda r: phase_score(r, jnp.zeros(0, bool), sigma_rad=SIGMA))(jnp.zeros(0)).shape == (0,)
+    for candidates, number in ((3, 0), (0, 4), (0, 0)):
+        shape = (candidates, number)
+        some = Snapshots(jnp.zeros(number), jnp.full(number, 9e8), jnp.ones(shape), jnp.ones(shape, bool))
+        said = match_scores(some, key=jax.random.key(0), num_rounds=2)
+        np.testing.assert_array_equal(said, np.zeros(candidates))
+
+
 def test_score_refuses_unknown_settings() -> None:
     counted = jnp.ones(3, bool)
     with pytest.raises(ValueError, match="multiple is 3"):

@@ -15,8 +15,10 @@ def splice_phase(
 
     theta_i = theta_{i-1} + wrap(phi_i - phi_{i-1}). Right as long as the tag moves by less than an eighth of a
     wavelength times period / pi between reads. Reads that are not valid repeat the last one before them (0 at first).
-    Gradient: the identity, since whole periods carry none.
+    Gradient: the identity, since whole periods carry none. No reads give none.
     """
+    if not phase_rad.shape[0]:
+        return phase_rad
     last = _last_valid(valid)
     held = jnp.where(last >= 0, phase_rad[jnp.maximum(last, 0)], 0.0)
     begun = (last[1:] >= 0) & (last[:-1] >= 0)

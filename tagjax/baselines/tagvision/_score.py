@@ -49,18 +49,19 @@ def phase_score(
     ("first": the diversity term drops out), or that itself ("absolute": the term is known and taken off already),
     wrapped to [-pi, pi). The paper's weight is the density f itself: a constant factor more. With `multiple` 2
     residuals count modulo pi, which pi flips leave alone. 0 where nothing counts, or one snapshot with the first as
-    reference, which says nothing. Differentiable in the residuals.
+    reference, which says nothing. Differentiable in the residuals; those that do not count may be anything, NaN too.
     """
     dtype = residual_rad.dtype
-    if reference == "first":
-        start = jnp.take(residual_rad, jnp.argmax(counted))
-        theta, least = residual_rad - start[None], 2
-    elif reference == "absolute":
-        theta, least = residual_rad, 1
-    else:
+    if reference not in ("first", "absolute"):
         raise ValueError(f"Unknown reference {reference!r}; expected 'first' or 'absolute'.")
     if multiple not in (1, 2):
         raise ValueError(f"multiple is {multiple}; expected 1, or 2 for reads with pi flips.")
+    if not residual_rad.shape[0]:
+        return jnp.zeros((), dtype)
+    theta, least = jnp.where(counted, residual_rad, 0.0), 1
+    if reference == "first":
+        start = jnp.take(theta, jnp.argmax(counted))
+        theta, least = theta - start[None], 2
     turned = wrap_to_pi(multiple * theta)
     sigma = jnp.broadcast_to(jnp.asarray(sigma_rad, dtype), turned.shape)
     weight = jnp.exp(-0.5 * jnp.square(turned / (multiple * sigma))) * counted.astype(dtype)
@@ -93,7 +94,7 @@ def residuals_rad(snapshots: Snapshots, hop_slope_rad_hz: Float[Array, ""]) -> F
     dtype = snapshots.phase_rad.dtype
     carriers = jnp.where(known, snapshots.carrier_hz, 0.0)
     centre_hz = safe_divide(jnp.sum(carriers), jnp.sum(known.astype(dtype)))
-    off_hz = snapshots.carrier_hz - centre_hz[None]
+    off_hz = jnp.where(known, snapshots.carrier_hz - centre_hz[None], 0.0)
     share = snapshots.valid.astype(dtype)
     distance_m = jnp.where(snapshots.valid, snapshots.distance_m, 0.0)
     mean_m = safe_divide(jnp.sum(distance_m, axis=1), jnp.sum(share, axis=1))
