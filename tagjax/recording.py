@@ -7,6 +7,8 @@ host clock. `Recording.check` holds a recording against what every later stage r
 from __future__ import annotations
 
 import dataclasses
+import math
+import numbers
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -17,6 +19,13 @@ from ._types import LazyArray
 
 MAX_RANGE_M = 30.0
 """Depth beyond this is taken for a wrong unit: no RGB-D camera of the kind reaches it."""
+
+
+_LENSES = (0, 4, 5, 8, 12, 14)
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(float(value))
 
 
 class RecordingError(ValueError):
@@ -54,6 +63,21 @@ class Intrinsics:
     def matrix(self) -> np.ndarray:
         """The 3x3 camera matrix."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]], dtype=np.float64)
+
+    def check(self) -> None:
+        """Raise `RecordingError` for what no camera has."""
+        if not all(isinstance(side, numbers.Integral) and side > 0 for side in (self.width, self.height)):
+            raise RecordingError(f"Intrinsics: {self.width} x {self.height}; expected a picture's size, whole pixels.")
+        for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
+            value = getattr(self, name)
+            if not _finite(value) or (name in ("fx_px", "fy_px") and value <= 0):
+                kind = "positive" if name in ("fx_px", "fy_px") else "finite"
+                raise RecordingError(f"Intrinsics: {name} is {value!r}; expected a {kind} number of pixels.")
+        if len(self.distortion) not in _LENSES or not all(map(_finite, self.distortion)):
+            raise RecordingError(
+                f"Intrinsics: distortion is {self.distortion!r}; expected finite k1 k2 p1 p2 k3, as many as OpenCV takes "
+                f"({', '.join(map(str, _LENSES))})."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,25 +289,27 @@ class Recording:
         """The same video with other reads (and, if given, other truth)."""
         return dataclasses.replace(self, reads=reads, truth=self.truth if truth is None else truth)
 
-    def check(self) -> None:
+    def check(self, *, depth: bool = True) -> None:
         """Raise `RecordingError` where a later stage could not go on; warn where it can.
 
-        Reads frame metadata and three depth frames only, so that it stays cheap for a remote recording.
+        Reads frame metadata and three depth frames only, so that it stays cheap for a remote recording; nothing is asked
+        of depth without `depth`. A recording that has none is warned of: TagAttention needs it, the forerunners do not.
         """
         num_frames, shape = self.num_frames, self.image_shape
         if num_frames == 0:
             raise RecordingError(f"{self.name}: no frame. A recording needs at least one.")
+        self.intrinsics.check()
         if self.colour.shape != (num_frames, *shape, 3) or self.colour.dtype != np.uint8:
             raise RecordingError(
                 f"{self.name}: colour is {self.colour.dtype} of shape {self.colour.shape}; expected uint8 of shape "
                 f"{(num_frames, *shape, 3)} (frames, height, width, RGB) as times and intrinsics say."
             )
-        if self.depth.shape != (num_frames, *shape):
+        if depth and self.depth.shape != (num_frames, *shape):
             raise RecordingError(
                 f"{self.name}: depth has shape {self.depth.shape}; expected {(num_frames, *shape)}, registered to colour. "
                 "Use geometry.register_depth for a depth camera beside the colour camera."
             )
-        if np.dtype(self.depth.dtype) not in (np.dtype(np.uint16), np.dtype(np.float32)):
+        if depth and np.dtype(self.depth.dtype) not in (np.dtype(np.uint16), np.dtype(np.float32)):
             raise RecordingError(f"{self.name}: depth is {self.depth.dtype}; expected uint16 mm or float32 m.")
         steps = np.diff(self.time_ns)
         if np.any(steps <= 0):
@@ -296,7 +322,8 @@ class Recording:
             raise RecordingError(
                 f"{self.name}: antennas_m has shape {self.antennas_m.shape}; expected finite (antennas, 3) metres."
             )
-        self._check_depth_values()
+        if depth:
+            self._check_depth_values()
         self.reads.check()
         if self.reads.num_reads:
             highest = int(self.reads.antenna.max())
@@ -312,14 +339,29 @@ class Recording:
                     "first frame). Reader and camera clocks differ: import with clock=arrival or give clock_offset_s."
                 )
 
-    def _check_depth_values(self) -> None:
-        sampled = sorted({0, self.num_frames // 2, self.num_frames - 1})
-        values = np.stack([self.depth_metres(frame) for frame in sampled])
-        measured = values[values > 0]
-        if measured.size == 0:
+    def check_has_depth(self) -> None:
+        """Raise `RecordingError` where none of the frames that `check` looks at has any depth."""
+        sampled, values = self._sampled_depth()
+        if not np.any(values > 0):
             raise RecordingError(
                 f"{self.name}: frames {sampled} hold no depth at all; TagAttention needs depth. Was it exported?"
             )
+
+    def _sampled_depth(self) -> tuple[list[int], np.ndarray]:
+        sampled = sorted({0, self.num_frames // 2, self.num_frames - 1})
+        return sampled, np.stack([self.depth_metres(frame) for frame in sampled])
+
+    def _check_depth_values(self) -> None:
+        sampled, values = self._sampled_depth()
+        measured = values[values > 0]
+        if measured.size == 0:
+            warnings.warn(
+                f"{self.name}: frames {sampled} hold no depth at all: TagAttention cannot trace here, only systems that "
+                "need none. Was it exported?",
+                RecordingWarning,
+                stacklevel=4,
+            )
+            return
         if np.median(measured) > MAX_RANGE_M or np.median(measured) < 0.05:
             raise RecordingError(
                 f"{self.name}: median depth {np.median(measured):.4g} m; expected 0.05 to {MAX_RANGE_M:g}. Wrong unit? uint16 "

@@ -1162,7 +1162,10 @@ def test_recordings_that_it_cannot_do_are_named(shop, calibration):
     assert "there is 1" in (tracer.inapplicable(one) or "")
     mute = dataclasses.replace(shop.reads, rssi_dbm=np.full(shop.reads.num_reads, np.nan, np.float32))
     assert "no RSSI" in (tracer.inapplicable(shop.with_reads(mute)) or "")
-    assert "floor" in (tracer.inapplicable(dataclasses.replace(shop, depth=np.zeros_like(shop.depth))) or "")
+    blind = dataclasses.replace(shop, depth=np.zeros_like(shop.depth))
+    assert tracer.inapplicable(blind) is None  # it sees no depth
+    in_rows = dataclasses.replace(shop, antennas_m=np.array([[x, 0.0, 0.0] for x in (0.0, 2.1, 4.2)]))
+    assert "picture's rows" in (tracer.inapplicable(in_rows) or "")
     assert tracer.at(shop).inapplicable(shop) is None
 
 

@@ -351,13 +351,44 @@ def test_truncated_and_foreign_stores_are_refused(recording, tmp_path):
         open_recording(tmp_path / "nowhere.zarr")
 
 
-def test_missing_depth_is_an_error_and_a_frame_without_is_carried(recording):
-    with pytest.raises(RecordingError, match="no depth at all"):
-        dataclasses.replace(recording, depth=np.zeros_like(recording.depth)).check()
+def test_missing_depth_is_said_and_refused_where_it_is_needed(recording, tmp_path):
+    flat = dataclasses.replace(recording, depth=np.zeros_like(recording.depth))
+    with pytest.warns(RecordingWarning, match="no depth at all: TagAttention cannot trace here"):
+        flat.check()
+    flat.check(depth=False)
+    save_recording(flat, tmp_path / "flat.zarr")
+    with pytest.warns(RecordingWarning, match="no depth at all"):
+        again = open_recording(tmp_path / "flat.zarr")
+    for one in (flat, again):
+        with pytest.raises(RecordingError, match="no depth at all; TagAttention needs depth"):
+            load_clip(one, 0, 6, stride=2)
+
+
+def test_a_frame_without_depth_is_carried(recording):
     hole = recording.depth.copy()
     hole[0] = 0
     with pytest.warns(RecordingWarning, match="frame 0 has no depth"):
         dataclasses.replace(recording, depth=hole).check()
+    hole[:6] = 0
+    clip = load_clip(dataclasses.replace(recording, depth=hole), 0, 6, stride=2)
+    assert not np.any(clip.frames.depth_m)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx_px": 0.0}, "fx_px is 0.0; expected a positive"),
+        ({"fy_px": float("nan")}, "fy_px is nan"),
+        ({"cx_px": float("inf")}, "cx_px is inf; expected a finite"),
+        ({"distortion": (0.1,)}, "as many as OpenCV takes"),
+        ({"distortion": (0.1, 0.0, 0.0, float("nan"))}, "expected finite k1"),
+        ({"width": 0, "height": -3}, "0 x -3; expected a picture's size"),
+    ],
+)
+def test_intrinsics_that_no_camera_has_are_errors(recording, change, message):
+    odd = dataclasses.replace(recording, intrinsics=dataclasses.replace(recording.intrinsics, **change))
+    with pytest.raises(RecordingError, match=message):
+        odd.check()
 
 
 def test_nan_depth_counts_as_missing(recording):

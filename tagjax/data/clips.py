@@ -139,8 +139,8 @@ def load_clip(
     `stride` keeps every n-th pixel in both directions. The radio is estimated from the recording's start, causally, so
     that a clip in the middle knows its past. `antennas` says whose reads are used and to where distances
     are (see `choose_antennas`). With `colour` the clip holds its pictures, and zero in place of the flow, which is
-    then a network's to make. Raises `RecordingError` for an unknown EPC or antenna and `ValueError` for frames outside
-    the recording or settings that no clip can have.
+    then a network's to make. Raises `RecordingError` for an unknown EPC or antenna or a recording without depth, and
+    `ValueError` for frames outside the recording or settings that no clip can have.
     """
     check_clip(stride=stride, window=window, max_reads=max_reads)
     if not 0 <= start < stop <= recording.num_frames:
@@ -149,6 +149,8 @@ def load_clip(
     chosen = choose_antennas(recording, named, antennas)
     intrinsics = recording.intrinsics.scaled(stride)
     depth = recording.depth_metres(slice(start, stop))
+    if not np.any(depth):  # frames without are carried, but not a whole recording
+        recording.check_has_depth()
     if recording.depth_kind == "range":
         depth = range_to_depth(depth, recording.intrinsics)
     depth = _thin_depth(depth, stride)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from ...recording import Recording, RecordingError
+from ...recording import Recording
 from ...tracer import Trace
 from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace
 from ._association import AssociationModel, HeldState, assignment_row, forward_start, forward_step
@@ -98,9 +98,8 @@ class GollerTracer(AbstractHostTracer):
         if self.site is None:
             try:
                 level_site(recording.antennas_m, self.antenna_height_m)
-                find_site(recording)
-            except (RecordingError, ValueError):
-                return "the antennas do not hang over a floor that the camera sees"
+            except ValueError:
+                return "no room frame without depth: the antennas must hang in a line that is not the picture's rows"
         return None
 
     def init(self, camera: HostCamera) -> GollerState:
