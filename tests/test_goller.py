@@ -1164,6 +1164,7 @@ def test_recordings_that_it_cannot_do_are_named(shop, calibration):
     assert "no RSSI" in (tracer.inapplicable(shop.with_reads(mute)) or "")
     blind = dataclasses.replace(shop, depth=np.zeros_like(shop.depth))
     assert tracer.inapplicable(blind) is None  # it sees no depth
+    assert next(host_trace(tracer, blind))[0] == 0
     in_rows = dataclasses.replace(shop, antennas_m=np.array([[x, 0.0, 0.0] for x in (0.0, 2.1, 4.2)]))
     assert "picture's rows" in (tracer.inapplicable(in_rows) or "")
     assert tracer.at(shop).inapplicable(shop) is None

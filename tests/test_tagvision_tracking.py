@@ -257,6 +257,45 @@ def test_where_the_method_cannot_apply_it_says_why(drawn: Recording) -> None:
         next(host_trace(TagVision(scenes.OVER), drawn.with_reads(TagReads.empty())))
 
 
+def _damaged(drawn: Recording, part: str) -> Recording:
+    reads, phase = drawn.reads, drawn.reads.phase_rad.copy()
+    phase[3] = np.nan
+    changes: dict[str, dict] = {
+        "unsorted": {"reads": reads[np.arange(reads.num_reads)[::-1]]},
+        "phase": {"reads": dataclasses.replace(reads, phase_rad=phase)},
+        "size": {"colour": drawn.colour[:, 1:]},
+        "grey": {"colour": drawn.colour[..., 0]},
+        "floats": {"colour": drawn.colour[:] / np.float32(255)},
+        "antenna": {"antennas_m": np.full((1, 3), np.nan)},
+        "backwards": {"time_ns": drawn.time_ns[::-1].copy()},
+        "focal": {"intrinsics": dataclasses.replace(drawn.intrinsics, fx_px=float("nan"))},
+    }
+    return dataclasses.replace(drawn, **changes[part])
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ("unsorted", "time goes back"),
+        ("phase", "1 of .* values of phase_rad are not finite"),
+        ("size", "colour is uint8 of shape .* as times and intrinsics say"),
+        ("grey", "height, width, RGB"),
+        ("floats", "colour is float32"),
+        ("antenna", "expected finite"),
+        ("backwards", "strictly increasing times"),
+        ("focal", "fx_px is nan"),
+    ],
+)
+def test_a_damaged_recording_is_refused(drawn: Recording, part: str, message: str) -> None:
+    with pytest.raises(RecordingError, match=message):
+        next(host_trace(TagVision(scenes.OVER), _damaged(drawn, part)))
+
+
+def test_depth_may_be_missing(drawn: Recording) -> None:
+    blind = dataclasses.replace(drawn, depth=np.zeros_like(drawn.depth))
+    assert next(host_trace(TagVision(scenes.OVER), blind))[0] == 0
+
+
 def test_blobs_without_tags_and_tags_without_blobs() -> None:
     rng = np.random.default_rng(20)
     still = np.stack([scenes.picture(STILL, rng) for _ in range(12)])

@@ -111,12 +111,13 @@ def host_trace(
 ) -> Iterator[tuple[int, Trace]]:
     """Run a host tracer over a recording: every frame's number and `Trace` (NumPy leaves, tags in the order of `epcs`).
 
-    One frame at a time, so that no masks pile up. Raises `RecordingError` where there is no tag, or where the method
-    cannot apply; the message is `inapplicable`'s.
+    One frame at a time, so that no masks pile up. Raises `RecordingError` where there is no tag, for a recording that
+    `Recording.check` refuses (depth may be missing), or where the method cannot apply; the message is `inapplicable`'s.
     """
     named = tuple(recording.resolve_epcs(epcs))
     if not named:
         raise RecordingError(f"{recording.name}: no tag to trace. The recording holds no read, or epcs is empty.")
+    recording.check(depth=False)
     reason = tracer.inapplicable(recording)
     if reason is not None:
         raise RecordingError(f"{recording.name}: {type(tracer).__name__} does not apply: {reason}")
