@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -1090,6 +1091,37 @@ def test_without_calibration_it_says_what_to_do(shop, tmp_path):
         calibrate(dataclasses.replace(moving, time_ns=shop.time_ns[8:60]))
     with pytest.raises(RecordingError, match="tag_position_m"):
         carried(dataclasses.replace(shop, truth=None))
+
+
+_SKEW, _MEAN = ".location.antennas.skew_m", ".location.antennas.mean_m"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        (_SKEW, {}, r"no calibration .*skew_m is {}; expected a number for each antenna"),
+        (_SKEW, "abc", "no calibration .*is 'abc'"),
+        (_SKEW, None, "no calibration .*is None"),
+        (".alarm_threshold", "abc", "is 'abc'"),
+        (".alarm_threshold", None, "is None"),
+        (".alarm_threshold", {}, "is {}"),
+        (".alarm_threshold", float("nan"), "1 values that are not finite"),
+        (".rssi_threshold_dbm", float("-inf"), "not finite"),
+        (".rssi_threshold_dbm", 1e300, "not finite"),
+        (_MEAN, [[0.0, 0.0], [1.0], [2.0, 0.0]], r"expected numbers of shape \(3, 2\)"),
+        (_MEAN, [[0.0, 0.0]], r"has shape \(1, 2\); expected numbers of shape \(3, 2\)"),
+    ],
+)
+def test_a_damaged_calibration_is_refused_by_name(calibration, tmp_path, name, value, message):
+    path = str(tmp_path / "calibration.json")
+    save_calibration(calibration, path)
+    values = json.loads(Path(path).read_text())
+    assert name in values
+    for one, other in zip(jax.tree.leaves(load_calibration(path)), jax.tree.leaves(calibration), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+    Path(path).write_text(json.dumps({**values, name: value}))
+    with pytest.raises(ValueError, match=rf"calibration\.json: .*({message})"):
+        load_calibration(path)
 
 
 @pytest.mark.slow

@@ -219,6 +219,27 @@ def test_foreign_weights_are_refused(tmp_path):
         save_detector(tmp_path / "bare.npz", network, {})
 
 
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"widths": [4, 6], "depth": 1},
+        {"widths": [4, 6, "8"], "depth": 1},
+        {"widths": [0, 6, 8], "depth": 1},
+        {"widths": [4, 6, 100_000], "depth": 1},
+        {"widths": [4.0, 6, 8], "depth": 1},
+        {"widths": None, "depth": 1},
+        {"widths": [4, 6, 8], "depth": 0},
+        {"widths": [4, 6, 8], "depth": 1_000_000},
+        {"widths": [4, 6, 8], "depth": True},
+        {"widths": [4, 6, 8]},
+    ],
+)
+def test_a_file_of_a_network_that_is_none_is_refused_before_it_is_built(tmp_path, network):
+    save_detector(tmp_path / "odd.npz", BoxNetwork((4, 6, 8), 1, key=jax.random.key(0)), {"network": network})
+    with pytest.raises(ValueError, match=r"odd\.npz: does not say which network .* depth of 1 to 32"):
+        load_detector(tmp_path / "odd.npz")
+
+
 def test_the_packaged_detector_is_small_and_says_where_it_comes_from():
     network, about = load_detector()
     assert about["recipe"]["steps_done"] > 0

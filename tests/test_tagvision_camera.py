@@ -257,3 +257,38 @@ def test_a_calibration_file_is_read_back_or_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps({**values, "rotation": [[1, 0, 0]] * 3}))
     with pytest.raises(ValueError, match="damaged"):
         load_camera(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("fx_px", 0),
+        ("fx_px", None),
+        ("fy_px", float("nan")),
+        ("cx_px", "640"),
+        ("cy_px", float("inf")),
+        ("width", -3),
+        ("height", 720.5),
+        ("distortion", [0.1]),
+        ("distortion", "abcd"),
+        ("distortion", [0.1, 0.0, 0.0, None, 0.0]),
+        ("distortion", 7),
+        ("translation_m", [0.0, 1.0]),
+        ("translation_m", [0.0, 1.0, "2"]),
+        ("translation_m", [0.0, 1.0, float("inf")]),
+        ("translation_m", None),
+        ("rotation", [[1, 0], [0, 1]]),
+        ("rotation", [[1, 0, 0], [0, 1], [0, 0, 1]]),
+        ("rotation", "eye"),
+        ("intrinsics", [1, 2]),
+        ("reprojection_px", "small"),
+    ],
+)
+def test_a_damaged_calibration_file_is_refused_by_name(tmp_path: Path, name: str, value: object) -> None:
+    path = tmp_path / "camera.json"
+    save_camera(_tilted(), path)
+    values = json.loads(path.read_text())
+    (values if name in values else values["intrinsics"])[name] = value
+    path.write_text(json.dumps(values))
+    with pytest.raises(ValueError, match=r"camera\.json: damaged calibration"):
+        load_camera(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -58,31 +59,49 @@ def calibrate(recording: Recording, *, floor_dbm: float = FLOOR_DBM, fit_means: 
     return Calibration(make_location(antennas), make_association(), jnp.asarray(0.5), jnp.asarray(-60.0))
 
 
-def save_calibration(calibration: Calibration, path: Path) -> None:
+def save_calibration(calibration: Calibration, path: str | Path) -> None:
     """Write a calibration as JSON."""
     leaves = {jax.tree_util.keystr(key): np.asarray(leaf).tolist() for key, leaf in _leaves(calibration)}
-    path.write_text(json.dumps(leaves, indent=1) + "\n")
+    Path(path).write_text(json.dumps(leaves, indent=1) + "\n")
 
 
-def load_calibration(path: Path) -> Calibration:
-    """Read a calibration. Raises `ValueError` where there is none, or not this one's numbers."""
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration. Raises `ValueError` where there is none, or not this one's finite numbers."""
     try:
-        found = json.loads(path.read_text())
-        num = len(found[".location.antennas.skew_m"])
+        found = json.loads(Path(path).read_text())
+        skew_m = found[".location.antennas.skew_m"]
+        if not isinstance(skew_m, list) or not skew_m:
+            raise ValueError(f"skew_m is {reprlib.repr(skew_m)}; expected a number for each antenna")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path}: no calibration ({type(error).__name__}: {error}). Calibrate from a tag grid: experiments.goller does."
         ) from error
+    num = len(skew_m)
     antennas = AntennaModel(jnp.zeros((num, 2)), jnp.zeros((num, 2)), jnp.zeros(num), jnp.zeros(num), jnp.zeros(()))
     like = Calibration(make_location(antennas), make_association(), jnp.zeros(()), jnp.zeros(()))
-    names = [jax.tree_util.keystr(key) for key, _ in _leaves(like)]
-    if sorted(names) != sorted(found):
-        raise ValueError(f"{path}: holds {', '.join(sorted(found))}; expected {', '.join(sorted(names))}.")
-    leaves = [jnp.asarray(found[name], jnp.float32) for name in names]
-    for name, leaf, (_, wanted) in zip(names, leaves, _leaves(like), strict=True):
-        if leaf.shape != wanted.shape:
-            raise ValueError(f"{path}: {name} has shape {leaf.shape}; expected {wanted.shape}. Calibrate again.")
+    wanted = {jax.tree_util.keystr(key): np.shape(leaf) for key, leaf in _leaves(like)}
+    if sorted(wanted) != sorted(found):
+        raise ValueError(f"{path}: holds {', '.join(sorted(found))}; expected {', '.join(sorted(wanted))}.")
+    leaves = [_numbers(found[name], shape, f"{path}: {name}") for name, shape in wanted.items()]
     return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(like), leaves)
+
+
+def _numbers(value: Any, shape: tuple[int, ...], where: str) -> Array:
+    """Finite numbers of that shape, as lists of lists."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # ragged
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf" or array.shape != shape:
+        held = f"has shape {array.shape}" if array.dtype.kind in "iuf" else f"is {reprlib.repr(value)}"
+        raise ValueError(f"{where} {held}; expected numbers of shape {shape}. Calibrate again.")
+    with np.errstate(over="ignore"):
+        array = array.astype(np.float32)
+    if not np.all(np.isfinite(array)):
+        raise ValueError(
+            f"{where} holds {int(np.sum(~np.isfinite(array)))} values that are not finite. Calibrate again."
+        )
+    return jnp.asarray(array)
 
 
 def _leaves(calibration: Calibration) -> list[tuple[Any, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import jax
 
 from ...arrays_file import ArraysFile
 from ._network import BoxNetwork
+
+_WIDEST, _DEEPEST = 1024, 32
 
 PACKAGED = Path(__file__).parent / "detector.npz"
 """The weights that come with the package."""
@@ -34,9 +37,19 @@ def load_detector(path: str | Path | None = None) -> tuple[BoxNetwork, dict[str,
     """
     path = PACKAGED if path is None else Path(path)
     about = _FILE.about(path)
-    try:
-        settings = {"widths": tuple(about["network"]["widths"]), "depth": int(about["network"]["depth"])}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: does not say which network it is of ({type(error).__name__}: {error}).") from error
-    network = eqx.filter_eval_shape(lambda: BoxNetwork(**settings, key=jax.random.key(0)))
+    said: Any = about.get("network")
+    said = said if isinstance(said, Mapping) else {}
+    widths, depth = said.get("widths"), said.get("depth")
+    told = isinstance(widths, list) and len(widths) == 3 and all(_within(width, _WIDEST) for width in widths)
+    if not told or not _within(depth, _DEEPEST):
+        found = ", ".join(f"{key}: {reprlib.repr(value)}" for key, value in (("widths", widths), ("depth", depth)))
+        raise ValueError(
+            f"{path}: does not say which network it is of (found {found}; expected 3 whole widths of 1 to {_WIDEST} and a "
+            f"depth of 1 to {_DEEPEST}). Train again, or copy the file again."
+        )
+    network = eqx.filter_eval_shape(lambda: BoxNetwork((widths[0], widths[1], widths[2]), depth, key=jax.random.key(0)))
     return _FILE.fill(network, path), about
+
+
+def _within(value: Any, most: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -120,17 +121,27 @@ def load_camera(path: str | Path) -> PlaneCamera:
         raise ValueError(f"{path}: no calibration of format {FORMAT!r}. Make one with experiments.calibrate_camera.")
     if values.get("rotation") is None:
         raise ValueError(
-            f"{path}: holds intrinsics only; expected the camera's place too. Give pose=<picture> to find it."
+            f"{path}: holds intrinsics only; expected the camera's place too. Calibrate again with "
+            "'poses=[{picture: <the board lying on the plane>}]'."
         )
     try:
         intrinsics = dict(values["intrinsics"])
         intrinsics["distortion"] = tuple(intrinsics["distortion"])
-        error_px = values.get("reprojection_px")
+        lens, error_px = Intrinsics(**intrinsics), values.get("reprojection_px")
+        lens.check()
         return PlaneCamera(
-            Intrinsics(**intrinsics),
-            np.asarray(values["rotation"], np.float64),
-            np.asarray(values["translation_m"], np.float64),
+            lens,
+            _numbers(values, "rotation", (3, 3)),
+            _numbers(values, "translation_m", (3,)),
             float("nan") if error_px is None else float(error_px),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: damaged calibration ({type(error).__name__}: {error}). Make it again.") from error
+
+
+def _numbers(values: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """One of a file's arrays. Raises `ValueError` (ragged lists do as well) where it is not of finite numbers."""
+    array = np.asarray(values[name])
+    if array.dtype.kind not in "iuf" or array.shape != shape or not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} is {reprlib.repr(values[name])}; expected finite numbers of shape {shape}")
+    return array.astype(np.float64)
