@@ -20,7 +20,7 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
-    from tagjax.baselines.tagvision import CalibrateSettings, calibrate_folder, write_calibration
+    from tagjax.baselines.tagvision import CalibrateSettings, calibrate_folder, write_calibration, write_corners
     from tagjax.config import from_mapping
 
     values = resolved(config)
@@ -31,7 +31,12 @@ def main(config: DictConfig) -> None:
         settings = from_mapping(CalibrateSettings, values)
         found = calibrate_folder(settings)
         write_calibration(found, settings.out)
-    for line in (*found.said(), f"written to {settings.out}"):
+        drawn = write_corners(found, settings.out)
+    told = (
+        f"a board looks the same from either end: {drawn} shows the first corner and the axes. Where it is the other end "
+        "than you mean, give that corner's place as origin_m and turn_deg 180 more."
+    )
+    for line in (*found.said(), *([told] if settings.poses else []), f"written to {settings.out} and {drawn}"):
         console.print(line, markup=False)
 
 

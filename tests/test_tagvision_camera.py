@@ -24,8 +24,10 @@ from tagjax.baselines.tagvision import (
     find_corners,
     load_camera,
     locate,
+    read_picture,
     save_camera,
     write_calibration,
+    write_corners,
 )
 from tagjax.evaluation.tagvision import (
     PAPER_CAMERA,
@@ -117,7 +119,7 @@ def test_calibration_refuses_what_it_cannot_use() -> None:
         calibrate(views, board, 640, 480)
     flat = overhead(dataclasses.replace(PAPER_CAMERA, distortion=()), (0.0, 0.0, 1.0))
     parallel = [flat.to_picture(board.corners_m() + 0.05 * k * np.array([1.0, 0.6, 0.0])) for k in range(5)]
-    with pytest.raises(CalibrationError, match="all parallel"):
+    with pytest.raises(CalibrationError, match=r"all parallel .* not of 7 x 5 squares"):
         calibrate(parallel, board, 1280, 720)
     with pytest.raises(CalibrationError, match="finite"):
         calibrate([np.full_like(view, np.nan) for view in views], board, 1280, 720)
@@ -201,16 +203,30 @@ def test_a_folder_of_pictures_is_calibrated(tmp_path: Path) -> None:
     assert transform_error_m(found.plane, above, area).mean() < 1.56e-3
     assert any("empty.png" in line for line in found.said())
     assert any("reprojection error" in line for line in found.said())
+    assert [Path(seen.picture).name for seen in found.boards] == ["table0.png", "table1.png"]
+    assert not any("doubtful" in line for line in found.said())
     write_calibration(found, tmp_path / "camera.json")
     read = load_camera(tmp_path / "camera.json")
     np.testing.assert_allclose(read.rotation, found.plane.rotation)
     assert read.intrinsics == found.camera.intrinsics
 
+    drawn = read_picture(write_corners(found, tmp_path / "camera.json"))
+    assert (tmp_path / "camera_corners.png").is_file()
+    for number, seen in enumerate(found.boards):
+        x, y = np.rint(seen.corners_px[0] * 800 / 320).astype(int) + np.array([808 * number, 0])
+        ring = drawn[max(y - 14, 0) : y + 15, x - 14 : x + 15].astype(int)
+        assert np.sum(np.abs(ring - np.array([230, 0, 200])).max(axis=-1) < 30) > 20, seen.picture
+        assert np.any(np.abs(drawn[:, 808 * number :][:, :800].astype(int) - np.array([220, 40, 40])).max(axis=-1) < 9)
+
+    away = dataclasses.replace(poses[1], origin_m=(0.25, -0.06))
+    doubtful = calibrate_folder(CalibrateSettings(str(folder), poses=(poses[0], away))).said()
+    assert sum("table" in line and "origin_m and turn_deg right, the board's size" in line for line in doubtful) == 2
+
     settings = CalibrateSettings(str(folder), board=Board(9, 5))
     with pytest.raises(CalibrationError, match="none of 7 pictures shows a board of 9 x 5 squares"):
         calibrate_folder(settings)
     write_calibration(dataclasses.replace(found, plane=None), tmp_path / "camera.json")
-    with pytest.raises(ValueError, match="holds intrinsics only"):
+    with pytest.raises(ValueError, match=r"holds intrinsics only.*poses=\[\{picture"):
         load_camera(tmp_path / "camera.json")
 
 
@@ -218,17 +234,23 @@ def test_the_command_reports_or_says_what_is_wrong(tmp_path: Path) -> None:
     rng, run = np.random.default_rng(12), [sys.executable, "-m", "experiments.calibrate_camera"]
     for seed in range(4):
         cv2.imwrite(str(tmp_path / f"{seed}.png"), _draw_board(_held(seed), Board(), rng))
-    given = [f"pictures={tmp_path}", f"out={tmp_path / 'camera.json'}", f"hydra.run.dir={tmp_path / 'run'}"]
+    given = [f"pictures={tmp_path}", f"out={tmp_path / 'new' / 'camera.json'}", f"hydra.run.dir={tmp_path / 'run'}"]
     done = subprocess.run([*run, *given], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert "reprojection error" in done.stdout
-    assert json.loads((tmp_path / "camera.json").read_text())["intrinsics_reprojection_px"] < 0.15
+    assert (tmp_path / "new" / "camera_corners.png").is_file()
+    assert json.loads((tmp_path / "new" / "camera.json").read_text())["intrinsics_reprojection_px"] < 0.15
     failed = subprocess.run([*run, given[2]], capture_output=True, text=True, cwd=ROOT)
     assert failed.returncode == 1
     assert "give pictures=<folder" in failed.stderr
 
 
 def test_folders_that_cannot_be_calibrated_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CalibrationError, match="its folder cannot be made"):
+        calibrate_folder(CalibrateSettings(str(tmp_path), out=str(tmp_path / "file" / "camera.json")))
+    with pytest.raises(CalibrationError, match="is a folder; expected a file"):
+        calibrate_folder(CalibrateSettings(str(tmp_path), out=str(tmp_path)))
     with pytest.raises(CalibrationError, match="no such folder"):
         calibrate_folder(CalibrateSettings(str(tmp_path / "missing")))
     with pytest.raises(CalibrationError, match="no picture in it"):

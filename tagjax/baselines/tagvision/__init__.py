@@ -7,7 +7,16 @@ from __future__ import annotations
 
 from ._blobs import FLOWS, Blob, BlobSettings, backward_flow, find_blobs
 from ._calibration import Board, CalibrationError, CameraCalibration, calibrate, find_corners, locate
-from ._folder import CalibrateSettings, FolderCalibration, PosePicture, calibrate_folder, write_calibration
+from ._drawing import BoardSeen, draw_boards
+from ._folder import (
+    CalibrateSettings,
+    FolderCalibration,
+    PosePicture,
+    calibrate_folder,
+    read_picture,
+    write_calibration,
+    write_corners,
+)
 from ._match import NO_MATCH, Match, MatchSettings, match_tags
 from ._plane import PlaneCamera, load_camera, save_camera
 from ._score import PHASE_NOISE_RAD, Snapshots, draw_snapshots, match_scores, phase_score, residuals_rad, theory_rad
@@ -23,6 +32,7 @@ __all__ = [
     "BlobSettings",
     "BlobTrack",
     "Board",
+    "BoardSeen",
     "CalibrateSettings",
     "CalibrationError",
     "CameraCalibration",
@@ -41,6 +51,7 @@ __all__ = [
     "calibrate",
     "calibrate_folder",
     "colour_bins",
+    "draw_boards",
     "draw_snapshots",
     "find_blobs",
     "find_corners",
@@ -55,9 +66,11 @@ __all__ = [
     "pair_interpolated",
     "pair_nearest",
     "phase_score",
+    "read_picture",
     "residuals_rad",
     "save_camera",
     "theory_rad",
     "unsigned_phase",
     "write_calibration",
+    "write_corners",
 ]

@@ -130,7 +130,8 @@ def calibrate(
         raise CalibrationError(
             f"The boards differ in tilt by {tilt_deg:.1f} degrees at most, and the focal length comes out at "
             f"{focal[0]:.3g} picture widths; expected more than {LEAST_TILT_DEG:g} degrees. Boards that are all parallel "
-            "leave the focal length open: tilt them in different ways."
+            f"leave the focal length open: tilt them in different ways. Or the board is not of {board.columns} x {board.rows} "
+            "squares: then a part of it was taken for the whole."
         )
     return CameraCalibration(
         intrinsics=Intrinsics(

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ._calibration import Board, CalibrationError, CameraCalibration, calibrate, find_corners, locate
+from ._drawing import BoardSeen, draw_boards
 from ._plane import FORMAT, PlaneCamera
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -46,12 +47,13 @@ class CalibrateSettings:
 
 @dataclasses.dataclass(frozen=True)
 class FolderCalibration:
-    """The result, and in which pictures the board was found."""
+    """The result, in which pictures the board was found, and those of `poses` (without any, the one that fits worst)."""
 
     camera: CameraCalibration
     plane: PlaneCamera | None
     used: tuple[str, ...]
     without_board: tuple[str, ...]
+    boards: tuple[BoardSeen, ...] = ()
 
     def said(self) -> list[str]:
         """What a user wants to know, line by line."""
@@ -74,6 +76,12 @@ class FolderCalibration:
             lines.append(
                 f"camera at x {x:.3f} y {y:.3f} z {z:.3f} m; reprojection error {self.plane.reprojection_px:.3f} px rms"
             )
+            lines += [
+                f"doubtful: the pose explains {board.picture} to {board.reprojection_px:.2f} px rms only, above {GOOD_PX:g} px. "
+                "Are its origin_m and turn_deg right, the board's size, and does it lie flat on the plane?"
+                for board in self.boards
+                if board.reprojection_px > GOOD_PX
+            ]
         return lines
 
 
@@ -88,8 +96,10 @@ def read_picture(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
 def calibrate_folder(settings: CalibrateSettings) -> FolderCalibration:
     """Find the board in every picture, calibrate, and place the camera where poses are given.
 
-    Raises `CalibrationError` for no folder, no pictures, pictures of several sizes, or too few that show the board.
+    Raises `CalibrationError` for no folder, no pictures, pictures of several sizes, or too few that show the board, and
+    where the folder of `out` cannot be made.
     """
+    _make_room(Path(settings.out))
     folder = Path(settings.pictures)
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: no such folder. Give pictures=<folder of pictures of the checkerboard>.")
@@ -115,13 +125,30 @@ def calibrate_folder(settings: CalibrateSettings) -> FolderCalibration:
         )
     height, width = next(iter(shapes))
     camera = calibrate(views, board, width, height, num_radial=settings.num_radial)
-    plane = _placed(settings.poses, board, camera, (height, width)) if settings.poses else None
-    return FolderCalibration(camera, plane, tuple(used), tuple(without))
+    if settings.poses:
+        plane, boards = _placed(settings.poses, board, camera, (height, width))
+        return FolderCalibration(camera, plane, tuple(used), tuple(without), boards)
+    worst = int(np.argmax(camera.view_reprojection_px))
+    held = locate(board.corners_m(), views[worst], camera.intrinsics)
+    seen = BoardSeen(
+        str(folder / used[worst]), views[worst], held, (0.0, 0.0), board, camera.view_reprojection_px[worst]
+    )
+    return FolderCalibration(camera, None, tuple(used), tuple(without), (seen,))
+
+
+def _make_room(out: Path) -> None:
+    """Make the folder that the result will lie in, before any work."""
+    if out.is_dir():
+        raise CalibrationError(f"out={out} is a folder; expected a file, as {out / 'camera.json'}.")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"out={out}: its folder cannot be made ({error}). Give another out=<file>.") from error
 
 
 def _placed(
     poses: Sequence[PosePicture], board: Board, camera: CameraCalibration, shape: tuple[int, int]
-) -> PlaneCamera:
+) -> tuple[PlaneCamera, tuple[BoardSeen, ...]]:
     places: list[Float[np.ndarray, "corners 3"]] = []
     pixels: list[Float[np.ndarray, "corners 2"]] = []
     for pose in poses:
@@ -140,6 +167,7 @@ def _placed(
         pixels.append(corners)
     # Corners may be found from either end of the board: what several places agree on is right.
     best: PlaneCamera | None = None
+    order: list[Float[np.ndarray, "corners 2"]] = []
     for flips in _flips(len(poses)):
         turned = [seen[::-1] if flip else seen for seen, flip in zip(pixels, flips, strict=True)]
         try:
@@ -147,12 +175,17 @@ def _placed(
         except CalibrationError:
             continue
         if best is None or found.reprojection_px < best.reprojection_px:
-            best = found
+            best, order = found, turned
     if best is None:
         raise CalibrationError(
             "No pose explains the pictures of the board on the plane: are origin_m and turn_deg right?"
         )
-    return best
+    boards = []
+    for pose, place, corners in zip(poses, places, order, strict=True):
+        error_px = float(np.sqrt(np.mean(np.sum((best.to_picture(place) - corners) ** 2, axis=1))))
+        x, y = float(place[0, 0]), float(place[0, 1])
+        boards.append(BoardSeen(pose.picture, corners, best, (x, y), board, error_px))
+    return best, tuple(boards)
 
 
 def _flips(count: int) -> list[tuple[bool, ...]]:
@@ -178,4 +211,15 @@ def write_calibration(found: FolderCalibration, path: str | Path) -> None:
         "uncertainty_px": found.camera.uncertainty_px,
         "without_board": found.without_board,
     }
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_text(json.dumps(values, indent=1, allow_nan=False) + "\n")
+
+
+def write_corners(found: FolderCalibration, path: str | Path) -> Path:
+    """Draw the boards that the pose came from beside the calibration: corners, first corner, axes. Returns the picture."""
+    path = Path(path)
+    beside = path.with_name(f"{path.stem}_corners.png")
+    sheet = draw_boards([(board, read_picture(board.picture)) for board in found.boards])
+    if not cv2.imwrite(str(beside), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
+        raise CalibrationError(f"{beside}: cannot be written.")
+    return beside
