@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from scipy.stats import binomtest, multivariate_normal
 
-from tagjax.baselines._interface import host_trace
+from tagjax.baselines import host_trace
 from tagjax.baselines.goller import (
     AntennaModel,
     BlobSettings,
@@ -1175,7 +1175,7 @@ def test_a_tracer_without_commissioning_learns_the_background_itself(calibration
 
 
 def test_a_state_is_stepped_once_and_depth_is_refused(shop, calibration):
-    from tagjax.baselines._interface import HostCamera, host_frames
+    from tagjax.baselines import HostCamera, host_frames
 
     tracer = GollerTracer(calibration, LOOKING_DOWN).at(shop)
     camera = HostCamera(LENS, ANTENNAS_M, ("leaver",))

@@ -107,6 +107,11 @@ def test_the_package_imports_light():
     assert done.returncode == 0, done.stderr
 
 
+def test_what_the_forerunners_share_needs_no_opencv():
+    code = "import sys, tagjax.baselines; tagjax.baselines.host_trace; sys.exit('cv2' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
 @pytest.mark.parametrize("path", MODULES, ids=str)
 def test_public_names_are_documented(path):
     tree = ast.parse(path.read_text())

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tagjax.baselines._interface import HostCamera, HostFrame, host_trace
+from tagjax.baselines import HostCamera, HostFrame, host_trace
 from tagjax.baselines.tagview import (
     AbstractDetector,
     BoxDetector,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tagvision_scenes as scenes
 
-from tagjax.baselines._interface import Claim, HostCamera, claims_to_trace, host_frames, host_trace
+from tagjax.baselines import Claim, HostCamera, claims_to_trace, host_frames, host_trace
 from tagjax.baselines.tagvision import (
     BlobSettings,
     MatchSettings,
