@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -33,3 +34,21 @@ def in_a_line(command: str, *more: type[Exception]) -> Iterator[None]:
 def sweeping() -> bool:
     """Whether this is a job of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
+
+
+def refuse_dropped_choices(hints: Mapping[str, str] | None = None) -> None:
+    """Raise `ValueError` for a group's choice that does not exist: of optional groups Hydra drops it without a word.
+
+    `hints` say what to do instead, by `<group>=<choice>`.
+    """
+    runtime = HydraConfig.get().runtime
+    folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
+    for key, chosen in runtime.choices.items():
+        group = str(key).partition("@")[0]
+        if chosen is None or group.split("/")[0] == "hydra":
+            continue
+        known = sorted({path.stem for folder in folders for path in (folder / group).glob("*.yaml")})
+        for choice in [chosen] if isinstance(chosen, str) else list(chosen):
+            if not any((folder / group / f"{str(choice).removesuffix('.yaml')}.yaml").is_file() for folder in folders):
+                hint = (hints or {}).get(f"{group}={choice}", f"known are {', '.join(known)}.")
+                raise ValueError(f"{key}={choice}: there is no such choice; {hint}")

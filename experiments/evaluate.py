@@ -15,9 +15,15 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from .errors import in_a_line
+from .errors import in_a_line, refuse_dropped_choices
 from .help import answer_help
 from .train import CONFIGS, resolved
+
+FORERUNNERS = {
+    f"tracer={name}": f"{name} sees pictures, not clips. On a recording of your own: tagjax.baselines.host_trace (README, "
+    f"The forerunners); on simulated suites: python -m experiments.{name}, and experiments.compare beside TagAttention."
+    for name in ("tagvision", "tagview", "goller")
+}
 
 
 def run_configuration(run: str | None) -> dict[str, Any] | None:
@@ -43,6 +49,7 @@ def main(config: DictConfig) -> float:
     values = resolved(config)
     folder = Path(HydraConfig.get().runtime.output_dir)
     with in_a_line("evaluate"):
+        refuse_dropped_choices(FORERUNNERS)
         checked = from_mapping(EvaluateConfig, values)
         OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
         summary = run_evaluation(checked, folder, run_values=run_configuration(checked.run))

@@ -14,7 +14,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from .errors import in_a_line
+from .errors import in_a_line, refuse_dropped_choices
 from .help import answer_help
 from .train import CONFIGS, resolved
 
@@ -30,9 +30,10 @@ def main(config: DictConfig) -> None:
     values = resolved(config)
     progress = values.pop("progress")
     folder = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
     console = Console()
     with in_a_line("tagvision"):
+        refuse_dropped_choices()
+        OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
         checked = from_mapping(TagVisionExperiment, values)
         with console.status("TagVision") as status:
             metrics = run_tagvision(checked, folder, on_progress=status.update if progress else None)

@@ -15,7 +15,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from .errors import in_a_line
+from .errors import in_a_line, refuse_dropped_choices
 from .help import answer_help
 from .run_folder import keep_configuration
 from .search import told, trials_left
@@ -42,6 +42,7 @@ def main(config: DictConfig) -> float | None:
     values = resolved(config)
     folder = Path(HydraConfig.get().runtime.output_dir)
     with in_a_line("train", DivergedError):
+        refuse_dropped_choices()
         checked = from_mapping(TrainConfig, values)
         keep_configuration(folder, values)
         score = told(run_training(checked, folder), folder, checked.loop.num_steps)
