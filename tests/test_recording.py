@@ -186,7 +186,10 @@ def test_numpy_values_in_attributes_are_made_plain(recording, tmp_path):
     odd = _unchecked(
         recording,
         intrinsics=_unchecked(
-            lens, fx_px=np.float32(lens.fx_px), width=np.int64(32), distortion=(np.float32(0.5), np.float64(0))
+            lens,
+            fx_px=np.float32(lens.fx_px),
+            width=np.int64(32),
+            distortion=(np.float32(0.5), np.float64(0), 0.0, np.float32(0)),
         ),
         clock=_unchecked(
             ClockAudit(0.0, 2.0, float("nan"), 7, "unix"), offset_s=np.float32(1.5), num_reads=np.int64(7)
@@ -204,7 +207,7 @@ def test_numpy_values_in_attributes_are_made_plain(recording, tmp_path):
     save_recording(odd, tmp_path / "a.zarr")
     again = open_recording(tmp_path / "a.zarr")
     assert again.truth.tag_to_label == {"tag-a": 1, "tag-b": 2}
-    assert again.intrinsics == dataclasses.replace(lens, distortion=(0.5, 0.0))
+    assert again.intrinsics == dataclasses.replace(lens, distortion=(0.5, 0.0, 0.0, 0.0))
     assert again.clock.num_reads == 7
     assert np.isnan(again.clock.residual_ms)
     assert again.reads.hop_table_hz == (9e8, 9.1e8)
