@@ -81,6 +81,17 @@ def test_pictures_with_mat_depth_are_imported_as_they_are(folder, importing, tmp
     np.testing.assert_array_equal(again.colour[2], recording.colour[2])
 
 
+def test_frames_come_in_the_order_of_the_numbers_in_their_names(folder, importing):
+    for number in range(4):
+        for old, new in ((f"image{number:03d}", f"image{number + 8}"), (f"masks/{number:03d}", f"masks/{number + 8}")):
+            for path in folder.glob(f"{old}.*"):
+                path.rename(folder / f"{new}{path.suffix}")
+    recording = importing(masks=folder / "masks")
+    for number in range(4):
+        np.testing.assert_array_equal(recording.depth[number], _depth_mm(number))
+        assert recording.truth.labels[number].max() == number + 1
+
+
 def test_frames_that_are_files_behave_as_arrays(importing):
     depth = importing().depth
     np.testing.assert_array_equal(depth[1:3], [_depth_mm(1), _depth_mm(2)])

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import re
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from ..recording import RecordingError
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Files of one folder by their names, the numbers in these by their value: frame2 before frame10."""
+    return sorted(paths, key=lambda path: (_parts(path.stem), path.name))
+
+
+def _parts(stem: str) -> list[str | int]:
+    return [int(part) if number % 2 else part for number, part in enumerate(re.split(r"([0-9]+)", stem))]
 
 
 def _jpeg_is_whole(data: bytes) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-import re
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +24,7 @@ from rich.progress import Progress, track
 
 from .._types import LazyArray
 from ..recording import RecordingError
-from .picture_files import read_colour
+from .picture_files import in_order, read_colour
 from .prepared import made_once
 from .store import open_recording
 from .stream import Stream
@@ -89,7 +88,7 @@ class ImageFolder:
     """
 
     def __init__(self, folder: Path):
-        self._files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=_place)
+        self._files = in_order(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
         if len(self._files) < 2:
             raise RecordingError(
                 f"{folder} holds {len(self._files)} pictures ({', '.join(IMAGE_ENDINGS)}); a flow needs at least two."
@@ -107,12 +106,6 @@ class ImageFolder:
                 "opened. Leave it as it is during a run."
             )
         return picture
-
-
-def _place(path: Path) -> tuple[list[str | int], str]:
-    """Where a file comes in its folder: by its name, the numbers in it by their value."""
-    parts = re.split(r"([0-9]+)", path.stem)
-    return [int(part) if number % 2 else part for number, part in enumerate(parts)], path.name
 
 
 def _common_shape(folder: Path, files: Sequence[Path]) -> tuple[int, ...]:

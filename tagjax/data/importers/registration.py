@@ -17,6 +17,7 @@ import scipy.optimize
 from jaxtyping import UInt8, UInt16
 
 from ...recording import RecordingError
+from ..picture_files import in_order
 from .rgbd_folder import DepthToColour, load_calibration, read_colour, read_mat_depth
 
 NO_CORRECTION = (0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
@@ -169,7 +170,7 @@ def estimate_correction(
 
 def estimate_folder_correction(folder: str | Path, calibration: str | Path) -> ResidualCorrection:
     """`estimate_correction` from `FOLDER_FRAMES` frames, evenly spread, of a folder that `import_jpg_mat` reads."""
-    pictures = sorted(Path(folder).glob("*.jpg"))
+    pictures = in_order(Path(folder).glob("*.jpg"))
     if not pictures:
         raise RecordingError(f"{folder}: no .jpg file; expected pictures with .mat files of the same names.")
     pictures = [pictures[i] for i in _every(len(pictures), FOLDER_FRAMES)]

@@ -13,7 +13,7 @@ import scipy.io
 
 from ...geometry import register_depth, undistort
 from ...recording import Intrinsics, Recording, RecordingError, TagReads, Truth
-from ..picture_files import read_colour, read_labels, read_picture
+from ..picture_files import in_order, read_colour, read_labels, read_picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +132,7 @@ def import_jpg_mat(
     pictures, one a frame. The recording has no tag reads.
     """
     folder = Path(folder)
-    pictures = sorted(folder.glob("*.jpg"))
+    pictures = in_order(folder.glob("*.jpg"))
     if not pictures:
         raise RecordingError(f"{folder}: no .jpg file; expected pictures with .mat files of the same names.")
     depths = [picture.with_suffix(".mat") for picture in pictures]
@@ -161,7 +161,7 @@ def import_jpg_mat(
 
     truth = None
     if masks is not None:
-        labels = sorted(Path(masks).glob("*.png"))
+        labels = in_order(Path(masks).glob("*.png"))
         if len(labels) != len(pictures):
             raise RecordingError(f"{masks}: {len(labels)} masks for {len(pictures)} pictures; expected one a picture.")
         truth = Truth(labels=FrameFiles(labels, read_labels, first.shape[:2], np.uint8))
