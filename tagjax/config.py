@@ -85,6 +85,10 @@ class VirtualTagSettings:
     def __post_init__(self) -> None:
         if not self.seeds:
             raise ConfigError("seeds is empty; expected at least one: a reader and its noise are drawn for each.")
+        if self.tracks is None and (self.labels, self.seeds, dict(self.reader)) != (None, (0,), {}):
+            raise ConfigError(
+                "tracks is null, so there is no virtual tag; give tracks (a CSV file), or nothing of the rest."
+            )
 
 
 @dataclasses.dataclass(frozen=True)

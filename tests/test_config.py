@@ -52,6 +52,7 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"data": {"clips": {"window": 1}}}, r"data\.clips: window is 1; expected at least 2"),
         ({"data": {"clips": {"max_reads": 0}}}, r"data\.clips: max_reads is 0; expected at least 1"),
         ({"data": {"clips": {"length": 6, "window": 7}}}, r"length is 6; expected at least the window's 7"),
+        ({"data": {"virtual_tag": {"seeds": [1]}}}, r"data\.virtual_tag: tracks is null, so there is no virtual tag"),
         ({"data": {"virtual_tag": {"seeds": []}}}, r"data\.virtual_tag: seeds is empty; expected at least one"),
         ({"scores": {"tags_at_once": 0}}, r"scores: tags_at_once is 0; expected at least 1"),
         ({"scores": {"frames_at_once": -1}}, r"scores: frames_at_once is -1; expected at least 1"),

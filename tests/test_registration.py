@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from tagjax.config import ConfigError, from_mapping
 from tagjax.data.importers.registration import estimate_correction, misalignment_px
 from tagjax.data.importers.rgbd_folder import DepthToColour, load_calibration, read_colour, read_mat_depth
 from tagjax.data.importers.settings import ImportSettings, import_recording
@@ -225,3 +226,8 @@ def test_a_real_residual_is_mended_in_held_out_frames(real_data, name, step) -> 
     assert misalignment_px(*held_out, view.corrected(found.correction)).median_px < 2.0
     assert abs(found.after.mean_shift_px[0]) < 1.0
     assert abs(found.after.mean_shift_px[1]) < 1.0
+
+
+def test_an_unknown_key_of_the_virtual_reader_is_told_before_anything_is_read():
+    with pytest.raises(ConfigError, match="reader: unknown key 'foo'; known are region, num_tags"):
+        from_mapping(ImportSettings, {"video": "gone", "reader": {"foo": 1}})

@@ -36,7 +36,7 @@ class ImportSettings:
     antennas_m: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0),)
     tracks: str | None = None  # a virtual tag on each of these tracks
     seed: int = 0
-    reader: dict[str, Any] = dataclasses.field(default_factory=dict)  # virtual reader
+    reader: ReaderSettings = dataclasses.field(default_factory=ReaderSettings)  # of the virtual tags
     out: str | None = None
 
 
@@ -67,7 +67,7 @@ def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[s
         recording = dataclasses.replace(recording, reads=table[0], clock=table[1])
     if settings.tracks is not None:
         tracks = load_tracks_csv(settings.tracks, recording.frame_time_s())
-        recording = attach_virtual_tags(recording, tracks, ReaderSettings(**settings.reader), seed=settings.seed)
+        recording = attach_virtual_tags(recording, tracks, settings.reader, seed=settings.seed)
         said.append(f"virtual tags on {len(tracks)} tracks, {recording.reads.num_reads} reads")
     recording.check()
     said.append(
