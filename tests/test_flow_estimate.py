@@ -623,7 +623,11 @@ def test_the_packaged_fast_flow_sees_a_picture_move():
     assert error_px.mean() < 0.5
 
 
-@pytest.mark.parametrize("name", ["zero", "dis_ultrafast", "pyramid", "pyramid_fast", "pyramid_mid", "pyramid+rest"])
+@pytest.mark.parametrize(
+    "name",
+    ["zero", "dis_ultrafast", "pyramid_fast", "pyramid+rest"]
+    + [pytest.param(name, marks=pytest.mark.slow) for name in ("pyramid", "pyramid_mid")],
+)
 def test_equal_pictures_have_no_flow_whatever_they_show(name: str) -> None:
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, (70, 90, 3), np.uint8)

@@ -246,7 +246,9 @@ def test_the_flownets_own_unit_does_not_leak_out(name):
         np.testing.assert_allclose(flow, np.broadcast_to([20 / stride, -40 / stride], flow.shape), rtol=1e-6)
 
 
-@pytest.mark.parametrize("octaves", [(0,), (-1, 0), (0, 1), (-1, 0, 1, 2), (-2, -1, 0)])
+@pytest.mark.parametrize(
+    "octaves", [(0,), (-1, 0), (0, 1), pytest.param((-1, 0, 1, 2), marks=pytest.mark.slow), (-2, -1, 0)]
+)
 def test_octaves_of_the_pyramid_go_on_from_one_another(octaves):
     """With heads that say (1, -2), every correction counts by the stride of its level on its octave."""
     network = PyramidFlow((6, 8), (1, 2), (2, 3), ((8,), (8,)), octaves)

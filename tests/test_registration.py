@@ -128,7 +128,7 @@ def test_the_misalignment_told_is_the_one_there_is(estimated) -> None:
     assert found.line().startswith(f"Residual registration: {found.before.median_px:.1f} px before, ")
 
 
-@pytest.mark.parametrize("shift_px", [(0.0, 0.0), (14.0, -17.0)])
+@pytest.mark.parametrize("shift_px", [(0.0, 0.0), pytest.param((14.0, -17.0), marks=pytest.mark.slow)])
 def test_right_is_left_where_it_is_and_far_off_is_brought_back(estimated, shift_px) -> None:
     told, (colour, depth), _, _ = estimated
     right = told.corrected(RESIDUAL)

@@ -157,6 +157,7 @@ def _load(one: Recording, start: int, stop: int, *, epcs: Sequence[str]) -> Clip
     return load_clip(one, start, stop, stride=1, flow="zero", epcs=epcs)
 
 
+@pytest.mark.slow
 def test_the_first_frame_shows_what_the_later_ones_tell(recording: Recording) -> None:
     """Whoever only looks forwards knows nothing yet."""
     settings = ScoreSettings(frames_at_once=7)

@@ -197,7 +197,7 @@ def test_a_clip_without_reads_or_depth_gives_finite_gradients() -> None:
         assert np.isfinite(float(logged["loss"]))
 
 
-@pytest.mark.parametrize("evidence", ["coherence", "likelihood"])
+@pytest.mark.parametrize("evidence", ["coherence", pytest.param("likelihood", marks=pytest.mark.slow)])
 def test_gradient_agrees_with_finite_differences(evidence: Literal["coherence", "likelihood"]) -> None:
     settings = dataclasses.replace(SETTINGS, evidence=evidence)
     with jax.enable_x64(True):
