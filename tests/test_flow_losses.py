@@ -386,7 +386,7 @@ def test_where_the_teacher_says_nothing_nothing_is_asked():
     teacher = whole.copy()
     teacher[:4] = np.nan
     levels = (jnp.asarray(_uneven(4, 4, seed=1)), jnp.asarray(_uneven(8, 8, seed=2)))
-    found, pull = jax.value_and_grad(_imitated)(levels, jnp.asarray(teacher))
+    found, pull = jax.jit(jax.value_and_grad(_imitated))(levels, jnp.asarray(teacher))
     assert np.isfinite(found)
     assert all(np.isfinite(leaf).all() for leaf in pull)
     assert not np.any(pull[1][:4])
