@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
+import equinox as eqx
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
@@ -19,8 +21,10 @@ from tagjax.data.store import save_recording
 from tagjax.evaluation.run import run_evaluation
 from tagjax.recording import RecordingError, TagReads
 from tagjax.training import run as run_module
-from tagjax.training.run import run_training
+from tagjax.training.loop import Trained
+from tagjax.training.run import make_tracer, run_training
 from tagjax.training.sources import join_reads, with_virtual_tags
+from tagjax.training.state import TrainState
 
 ROOT = Path(__file__).parents[1]
 
@@ -91,6 +95,23 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
     assert set(held_out) == {"learned"}
     with (tmp_path / "part" / "frames.csv").open() as file:
         assert len(file.readlines()) == 1 + 2 * 9
+
+
+def test_what_was_learned_is_kept_where_nothing_is_held_out(
+    recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def moved(state: TrainState, *_: Any, **__: Any) -> Trained[TrainState]:
+        return Trained(eqx.tree_at(lambda one: one.model, state, learned), interrupted=False)
+
+    values = _values(recordings)
+    values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+    values["data"]["validation"] = []
+    learned = make_tracer({**values["tracer"], "alpha_m2": 0.001})
+    monkeypatch.setattr(run_module, "train", moved)
+    assert math.isnan(run_training(from_mapping(TrainConfig, values), tmp_path))
+    kept = make_tracer(values["tracer"], str(tmp_path / "weights.json"))
+    assert run_module.parameters(kept) == pytest.approx(run_module.parameters(learned), rel=1e-6)
+    assert set(json.loads((tmp_path / "parameters.json").read_text())) == {"learned", "untrained", "learnable"}
 
 
 def test_what_a_run_says_of_itself_is_not_given_again() -> None:

@@ -79,7 +79,8 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     """Train as configured, evaluate on the held-out recordings, and return the number a sweep should maximise.
 
     That number is the mean box IoU on the held-out recordings if they are labelled, else the coherence of the held-out
-    tags' reads with their masks' motion. `folder` then holds checkpoints, metrics.jsonl, metrics.json and report/. An
+    tags' reads with their masks' motion; NaN without any. `folder` then holds checkpoints, metrics.jsonl, what was
+    learned (weights.json, parameters.json, flow.npz), and where anything was held out metrics.json and report/. An
     interrupted run leaves a checkpoint, goes on from it when started again in the same folder, and returns NaN. Of
     several processes (`config.distributed`) the first writes and evaluates; the others return NaN.
     """
@@ -99,10 +100,11 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
                 f"Stopped at step {int(trained.state.step)}; go on with the same command and hydra.run.dir={folder}"
             )
             return float("nan")
+        tracers, flows = _keep_learned(config, folder, trained.state)
         if not validation:
             console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
             return float("nan")
-        summary = _report(config, folder, trained.state, validation)
+        summary = _report(config, folder, tracers, flows, validation)
         first_name, found = next(iter(summary.items()))  # the learned tracer's, smoothed or not
         logger.report(folder / "report", found["all"], tracer=first_name)
     finally:
@@ -172,12 +174,14 @@ def _train(
     return trained, logger
 
 
-def _report(config: TrainConfig, folder: Path, state: TrainState, validation: Sequence[Recording]) -> dict[str, Any]:
-    """Evaluate the learned tracer beside that before the first step and the baselines; the report's summary.
+def _keep_learned(
+    config: TrainConfig, folder: Path, state: TrainState
+) -> tuple[dict[str, AbstractTracer], dict[str, str]]:
+    """Write what was learned; the learned tracer, that before the first step and the baselines; flows of their own.
 
     Where a flow network was learned with it, each of the two sees with its own, kept as flow.npz and
     flow_untrained.npz (flow_initial.npz, where it began from learned parameters).
-    The learned parameters are kept as weights.json.
+    The learned parameters are kept as weights.json, and all tracers' as parameters.json.
     """
     before = "untrained" if config.weights is None else "initial"
     models = {"learned": state.model, before: make_model(config)}
@@ -189,6 +193,17 @@ def _report(config: TrainConfig, folder: Path, state: TrainState, validation: Se
         recipe = dataclasses.asdict(config) | {"steps": int(state.step)}
         save_parameters(folder / "weights.json", tracers["learned"], config.tracer, plain({"recipe": recipe}))
     write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
+    return tracers, flows
+
+
+def _report(
+    config: TrainConfig,
+    folder: Path,
+    tracers: Mapping[str, AbstractTracer],
+    flows: Mapping[str, str],
+    validation: Sequence[Recording],
+) -> dict[str, Any]:
+    """Evaluate the tracers on what was held out; the report's summary."""
     summary = evaluate_tracers(
         tracers,
         validation,
