@@ -152,6 +152,23 @@ def test_of_many_makers_one_makes(tmp_path: Path) -> None:
     whole(found[-1], tmp_path)
 
 
+def test_a_folder_that_is_removed_while_another_maker_asks_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, asked, make_folder = [], [], os.mkdir
+
+    def overtaken(path: str | Path, mode: int = 0o777) -> None:
+        if str(path).endswith(".partial") and not asked:
+            asked.append(path)
+            raise FileExistsError
+        make_folder(path, mode)
+
+    monkeypatch.setattr(os, "mkdir", overtaken)
+    whole(made_once(tmp_path / "a.zarr", make(begun)), tmp_path)
+    assert asked
+    assert begun == [0]
+
+
 def test_makers_that_fail_and_makers_that_wait_do_not_disturb_each_other(tmp_path: Path) -> None:
     """Each failure takes the folder away from under those that wait for it."""
     target, begun = tmp_path / "a.zarr", []

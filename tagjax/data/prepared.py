@@ -145,7 +145,9 @@ def _workplace(target: Path) -> Iterator[Path]:
 def _locked(folder: Path) -> IO[bytes] | None:
     """The lock of a folder, which is made, once nobody else holds it; None where files cannot be locked."""
     while fcntl is not None:
-        folder.mkdir(exist_ok=True)
+        # With exist_ok an error of its own, where the folder goes between the attempt and the look at it.
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
         try:
             lock = (folder / _LOCK).open("ab")
         except FileNotFoundError:  # who was at work here has just finished, and removed the folder
