@@ -20,8 +20,7 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
     anything else does, and leaves the file as it was; also where the run may not go on, which the run itself refuses.
     """
     path = folder / "config.yaml"
-    begun = any(step.name.isdigit() for step in (folder / "checkpoints").glob("*"))
-    if begun and path.is_file():
+    if checkpoint_steps(folder) and path.is_file():
         if not values.get("resume", True):
             return
         before = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
@@ -34,6 +33,11 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     OmegaConf.save(OmegaConf.create(dict(values)), beside)
     os.replace(beside, path)
+
+
+def checkpoint_steps(folder: Path) -> list[int]:
+    """The steps after which a run has checkpoints, without a look into them."""
+    return [int(path.name) for path in (folder / "checkpoints").glob("*") if path.name.isdigit()]
 
 
 def _differences(before: Any, now: Any, where: str = "") -> list[str]:

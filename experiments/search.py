@@ -9,6 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from .errors import sweeping
+from .run_folder import checkpoint_steps
 
 
 def trials_left(
@@ -55,7 +56,7 @@ def told(score: float, folder: Path, num_steps: int) -> float | None:
     Raises `KeyboardInterrupt` in a sweep if the run was stopped before its last step, which is no failure: the jobs after
     it must not start. The run's checkpoint is then written.
     """
-    steps = [int(path.name) for path in (folder / "checkpoints").glob("*") if path.name.isdigit()]
+    steps = checkpoint_steps(folder)
     if math.isnan(score) and sweeping() and steps and max(steps) < num_steps:
         raise KeyboardInterrupt
     return None if math.isnan(score) else score

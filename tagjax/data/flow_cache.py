@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import time
 import uuid
 from pathlib import Path
 from typing import Any
@@ -18,14 +17,12 @@ from zarr.storage import LocalStore
 from ..flow.named import flow_key, make_flow, settled_along
 from ..flow.opencv import FlowFunction
 from ..recording import Recording, RecordingError
+from .prepared import remove_abandoned
 from .store import StoredFrames, create_array
 
 _FOLDER = "cache/flow"
 _VERSION = 3
 """To be raised when the same name gives another flow: older caches are then computed again."""
-
-_ABANDONED_S = 3600.0
-"""A partial cache that nothing was added to for so long is of a process that was killed."""
 
 _WAYS = ("forward", "backward")
 
@@ -152,8 +149,4 @@ def _clear(folder: Path) -> None:
         with contextlib.suppress(FileNotFoundError):
             os.rename(folder, aside)
         shutil.rmtree(aside, ignore_errors=True)
-    for partial in folder.parent.glob(".*.partial"):
-        with contextlib.suppress(OSError):
-            newest = max(path.stat().st_mtime for path in (partial, *partial.glob("*/c")))
-            if time.time() - newest > _ABANDONED_S:
-                shutil.rmtree(partial, ignore_errors=True)
+    remove_abandoned(folder.parent.glob(".*.partial"))

@@ -131,7 +131,8 @@ def _workplace(target: Path) -> Iterator[Path]:
         folder = target.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
         folder.mkdir()
     try:
-        _clear_abandoned(target)
+        # What killed processes left under names of their own: without locks, or by earlier releases.
+        remove_abandoned(target.parent.glob(f".{glob.escape(target.name)}.*.partial"))
         if not (folder / _DONE).exists():
             shutil.rmtree(folder / _MADE, ignore_errors=True)
         yield folder
@@ -181,9 +182,9 @@ def _remove(folder: Path) -> None:
         folder.rmdir()
 
 
-def _clear_abandoned(target: Path) -> None:
-    """Take away what killed processes left beside `target` under names of their own: without locks, or by earlier releases."""
-    for left in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+def remove_abandoned(folders: Iterable[Path]) -> None:
+    """Take away those of these folders, in which arrays were made, that nothing was added to for an hour."""
+    for left in folders:
         with contextlib.suppress(OSError):
             newest = max(path.stat().st_mtime for path in (left, *left.glob("c"), *left.glob("*/c")))
             if time.time() - newest > _ABANDONED_S:

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from ..config import ClipSettings, ConfigError, DataSettings, EvaluateConfig, TrainConfig, changed, from_mapping
-from ..data.store import open_recording
 from ..recording import Recording
 from ..training.checkpoint import Checkpoints
 from ..training.run import evaluate_tracers, initial_state, make_tracer, own_flow
-from ..training.sources import training_recordings, with_virtual_tags
+from ..training.sources import opened, training_recordings
 from ..training.state import TrainState
 from .evaluate import ScoreSettings
 
@@ -31,7 +30,7 @@ def held_out(data: DataSettings) -> list[Recording]:
     """The recordings that a run held out, without a look at those that it learned from."""
     if not data.recordings:
         return training_recordings(data)[1]
-    return [with_virtual_tags(open_recording(path), data.virtual_tag) for path in data.validation]
+    return opened(data.validation, data.virtual_tag)
 
 
 def run_evaluation(
@@ -66,7 +65,7 @@ def run_evaluation(
         clips, {**config.clips, **({} if config.stride is None else {"stride": config.stride})}, where="clips"
     )
     epcs = clips.epcs if config.epcs is None else config.epcs
-    recordings += [with_virtual_tags(open_recording(path), config.virtual_tag) for path in config.recordings]
+    recordings += opened(config.recordings, config.virtual_tag)
     if not recordings:
         raise ConfigError("No recording to evaluate on: give recordings=[a.zarr,...]; the run held none out.")
     tracers |= {name: make_tracer(settings) for name, settings in baselines.items()}

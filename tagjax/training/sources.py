@@ -49,17 +49,17 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
                 "data.virtual_tag is given, but data.recordings is empty; simulated recordings have tags of their own. "
                 "Name the recordings that the virtual tags are put on."
             )
+        return simulated_recordings(data.simulate)
     held_out = {_place(path) for path in data.validation}
     twice = [path for path in data.recordings if _place(path) in held_out]
     if twice:
         raise RecordingError(f"{', '.join(sorted(twice))}: named both for training and for validation; hold it out.")
-    if not data.recordings:
-        return simulated_recordings(data.simulate)
-    tag = data.virtual_tag
-    training, validation = (
-        [with_virtual_tags(open_recording(path), tag) for path in paths] for paths in (data.recordings, data.validation)
-    )
-    return training, validation
+    return opened(data.recordings, data.virtual_tag), opened(data.validation, data.virtual_tag)
+
+
+def opened(paths: Sequence[str], virtual_tag: VirtualTagSettings) -> list[Recording]:
+    """The recordings at these paths, with virtual tags where tracks are given. Raises as `open_recording` does."""
+    return [with_virtual_tags(open_recording(path), virtual_tag) for path in paths]
 
 
 def _place(path: str) -> str:

@@ -17,8 +17,8 @@ import scipy.optimize
 from jaxtyping import UInt8, UInt16
 
 from ...recording import RecordingError
-from ..picture_files import in_order
-from .rgbd_folder import DepthToColour, load_calibration, read_colour, read_mat_depth
+from ..picture_files import in_order, read_colour
+from .rgbd_folder import DepthToColour, load_calibration, read_mat_depth
 
 NO_CORRECTION = (0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
 """The correction that changes nothing, in the order of `DepthToColour.corrected`."""

@@ -28,6 +28,7 @@ from ...baselines.goller import (
     true_states,
 )
 from ...recording import Recording
+from ...sim.suites import SPLITS
 from ..report import write_json
 from ._figures import antenna_plot, association_plot, handover_plot, roc_plot, scene_picture
 from ._handover import Handover, follow
@@ -80,9 +81,6 @@ def scenario_paths(folder: Path, split: str, most: int | None = None) -> list[tu
     return [(variant, path) for variant, _, path in sorted(found)]
 
 
-_SPLITS = ("train", "validation", "test")
-
-
 def _handover_paths(config: GollerConfig) -> list[str]:
     """Recordings of a hand-over; none where the default folder has none."""
     folder = Path(config.scenarios).parent / "shop_handover" if config.handover is None else Path(config.handover)
@@ -105,7 +103,7 @@ def _check_paths(config: GollerConfig) -> None:
             f"grid={config.grid}: no such recording of a tag grid; {made.format('shop_grid', home)}/train/*.zarr."
         )
     folder = Path(config.scenarios)
-    if empty := [split for split in _SPLITS if not scenario_paths(folder, split, config.most)]:
+    if empty := [split for split in SPLITS if not scenario_paths(folder, split, config.most)]:
         told.append(
             f"scenarios={folder}: no recording in {', '.join(f'{split}/' for split in empty)}; expected some in each of a "
             f"suite's folders; {made.format('shop_exit', home)}."
@@ -138,7 +136,7 @@ def run_goller(
     antenna_plot(folder / "antennas.png", grid_statistic(grid, find_site(grid)), calibration.location.antennas)
     start, num_frames = time.perf_counter(), 0
     splits: dict[str, list[Example]] = {}
-    for split in _SPLITS:
+    for split in SPLITS:
         splits[split] = []
         for variant, path in scenario_paths(Path(config.scenarios), split, config.most):
             recording = open_recording(str(path))
