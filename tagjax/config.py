@@ -45,12 +45,15 @@ class ClipSettings:
     antennas: Antennas = None  # that distances are to: `all`, numbers from 1, or the one with the most reads if None
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
+    least_motion: float = 0.1  # training clips in which no tag is heard to move by so much are not drawn; 0 draws all
     workers: int = 0  # processes that load training clips; with none a thread does
 
     def __post_init__(self) -> None:
         check_clip(stride=self.stride, window=self.window, max_reads=self.max_reads)
         if self.length < self.window:
             raise ConfigError(f"length is {self.length}; expected at least the window's {self.window} frames.")
+        if not 0 <= self.least_motion < 1:
+            raise ConfigError(f"least_motion is {self.least_motion}; expected a share of coherence, 0 to less than 1.")
 
     def arguments(self) -> dict[str, Any]:
         """What `load_clip` and `clip_dataset` both take, by name."""

@@ -13,8 +13,8 @@ import pytest
 import synthetic_clips as synthetic
 
 from tagjax._numerics import SPEED_OF_LIGHT_M_S
-from tagjax.config import ConfigError, DataSettings, VirtualTagSettings
-from tagjax.data.clips import choose_antennas, clip_dataset, load_clip
+from tagjax.config import ClipSettings, ConfigError, DataSettings, VirtualTagSettings
+from tagjax.data.clips import choose_antennas, clip_dataset, load_clip, motion_heard
 from tagjax.recording import Recording, RecordingError, RecordingWarning, TagReads
 from tagjax.training.sources import join_reads, training_recordings
 
@@ -211,10 +211,45 @@ def test_recordings_of_which_no_clip_can_be_loaded_are_refused_at_once(recording
         make(recording, dataclasses.replace(recording, truth=None), estimator="truth")
 
 
+def _moving_from(num_frames: int, begin: int) -> Recording:
+    """The synthetic scene with both tags at rest before frame `begin`, half of their reads flipped."""
+    moving = synthetic.recording(num_frames)
+    reads, begin_ns = moving.reads, int(moving.time_ns[begin])
+    rests = reads.time_ns < begin_ns
+    flips = np.random.default_rng(0).integers(0, 2, reads.num_reads) * np.pi
+    phase = np.mod(np.where(rests, 1.0, reads.phase_rad) + flips, 2 * np.pi)
+    return dataclasses.replace(moving, reads=dataclasses.replace(reads, phase_rad=phase))
+
+
+def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
+    late = _moving_from(80, 40)
+    starts = range(0, 71, 10)
+    heard = motion_heard(late, starts, 10, ["tag-a", "tag-b"], [1])
+    assert (heard[:3] < 1e-9).all()  # one that ends where they begin shares its last piece with what comes
+    assert (heard[4:] > 0.2).all()
+    assert (motion_heard(late, starts, 10, ["tag-a"], [1]) <= heard + 1e-12).all()
+    assert not motion_heard(late, starts, 10, ["tag-a"], [2]).any()  # never read there
+    drawn = iter(clip_dataset([late], clip_length=10, step=10, seed=0, least_motion=0.1, stride=2))
+    assert {next(drawn).start for _ in range(8)} <= set(starts[3:])
+    everything = iter(clip_dataset([late], clip_length=10, step=10, seed=0, stride=2))
+    assert {next(everything).start for _ in range(8)} == set(starts)
+    still = _moving_from(40, 39)
+    with pytest.raises(
+        RecordingError, match=r"In no clip of 10 frames is a tag heard to move by 0\.1 or more \(the most"
+    ):
+        clip_dataset([still], clip_length=10, seed=0, least_motion=0.1, stride=2)
+
+
 def test_recordings_shorter_than_a_clip_are_named(recording: Recording) -> None:
     short = dataclasses.replace(synthetic.recording(4), name="short")
     with pytest.warns(RecordingWarning, match="short has 4 frames, fewer than a clip's 6: it gives no clip"):
         clip_dataset([recording, short], clip_length=6, seed=0, **SMALL)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_no_motion_loses_all_coherence_and_none_less_than_nothing(share: float) -> None:
+    with pytest.raises(ConfigError, match=rf"least_motion is {share}; expected a share of coherence"):
+        ClipSettings(least_motion=share)
 
 
 @pytest.mark.parametrize(

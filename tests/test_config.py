@@ -157,9 +157,10 @@ def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
     for name, settings in (("clips", config.ClipSettings()), ("scores", ScoreSettings())):
         assert changed(settings, values[name], where=name) == settings
     assert set(values["scores"]) == {field.name for field in dataclasses.fields(ScoreSettings)}
-    # A training clip's length, tags and workers mean nothing to an evaluation, which has its own epcs.
+    # A training clip's length, motion, tags and workers mean nothing to an evaluation, which has its own epcs.
     assert set(values["clips"]) == {field.name for field in dataclasses.fields(config.ClipSettings)} - {
         "length",
         "epcs",
+        "least_motion",
         "workers",
     }

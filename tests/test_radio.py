@@ -1,6 +1,8 @@
 """The radio side: closed forms, the paper's rules, and the robust estimator against simulated and real reads."""
 
 import csv
+import dataclasses
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +22,7 @@ from tagjax.rf.noise import pi_flip_share, thermal_sigma_rad
 from tagjax.rf.phase import distance_to_phase, phase_to_distance
 from tagjax.rf.reads import PhaseReads
 from tagjax.rf.refine import interpolation_weights
+from tagjax.rf.rest import MIN_READS, coherence_lost
 from tagjax.rf.unwrap import remove_jump, unwrap_paper
 from tagjax.rf.windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
 
@@ -512,3 +515,35 @@ def test_hopping_over_the_rail_costs_less_than_2_mm_against_unwrapping_each_chan
         alone.append(unwrapped - unwrapped.mean())
     error = estimated - estimated.mean() - np.mean(alone, axis=0)
     assert np.sqrt(np.mean(error**2)) < 0.002
+
+
+def test_coherence_lost_by_rest_is_that_of_the_reads_modulo_pi() -> None:
+    rng = np.random.default_rng(3)
+    count, edges = 400, np.array([0.0, 0.5, 1.0, 2.0, 2.01])
+    time_s = np.sort(rng.uniform(-0.2, 2.3, count))
+    carrier_hz = rng.choice([902.75e6, 915.25e6, 926.75e6, np.nan], count)
+    reads = TagReads(
+        epc=np.full(count, "a"),
+        time_ns=(time_s * 1e9).astype(np.int64) + 7_000_000_000,
+        antenna=rng.integers(1, 3, count).astype(np.int16),
+        carrier_hz=carrier_hz,
+        phase_rad=np.mod(rng.normal(0.0, 0.4, count) + np.pi * rng.integers(0, 2, count), 2 * np.pi),
+        rssi_dbm=np.full(count, -50, np.float32),
+        doppler_hz=np.full(count, np.nan, np.float32),
+    )
+    lost = coherence_lost(reads, edges, 7_000_000_000)
+    channel = np.unique(np.stack([reads.antenna, carrier_hz]), axis=1, return_inverse=True)[1]
+    time_s = (reads.time_ns - 7_000_000_000) * 1e-9
+    for piece, (begin, end) in enumerate(itertools.pairwise(edges)):
+        inside = (time_s > begin) & (time_s <= end) & np.isfinite(carrier_hz)
+        phase, weight = jnp.asarray(reads.phase_rad, jnp.float32), jnp.asarray(inside, jnp.float32)
+        found = coherence(
+            phase, weight, jnp.asarray(channel, jnp.int32), num_channels=8 + int(channel.max()), multiple=2
+        )
+        assert inside.sum() >= MIN_READS or piece == 3
+        assert lost[piece] == pytest.approx(1.0 - float(found) if piece < 3 else 0.0, abs=1e-5)
+    # Flips lose nothing, noise of sigma rad about 2 sigma^2 and a wave of a hand nearly all.
+    assert 0.15 < lost[2] < 2 * 0.4**2 + 0.02
+    assert not coherence_lost(TagReads.empty(), edges, 0).any()
+    wave = dataclasses.replace(reads, phase_rad=np.mod(4 * np.pi * 0.15 * np.sin(2 * np.pi * time_s) / 0.33, 2 * np.pi))
+    assert coherence_lost(wave, edges, 7_000_000_000)[:3].min() > 0.6

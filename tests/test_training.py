@@ -30,6 +30,7 @@ from tagjax.training.loss import (
     ObjectiveSettings,
     agreement,
     area,
+    calibration,
     clip_reads,
     compactness,
     contrast,
@@ -127,6 +128,31 @@ def test_reads_of_a_resting_tag_have_no_say() -> None:
     flipped = eqx.tree_at(lambda s: s.reads.phase_rad, still, still.reads.phase_rad + jnp.where(flips, jnp.pi, 0.0))
     _, numbers = eqx.filter_jit(contrast)(flipped, SETTINGS, KEY)
     assert float(numbers["moving"]) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_confidence_is_best_as_the_share_of_pieces_that_are_won() -> None:
+    seen = _said_with_true_steps(_clip())
+    judge = jax.jit(lambda s: calibration(s, SETTINGS, KEY)[0])
+    as_sure = lambda one, p: eqx.tree_at(lambda s: s.said.confidence, one, jnp.full_like(one.said.confidence, p))  # noqa: E731
+    shuffled = eqx.tree_at(lambda s: s.said.step_m, seen, seen.said.step_m[:, ::-1])
+    for one, share in ((seen, 1.0), (shuffled, 0.0)):  # every piece is won, and none
+        _, numbers = eqx.filter_jit(contrast)(one, SETTINGS, KEY)
+        assert float(numbers["own_wins"]) == pytest.approx(share)
+        for sure in (0.3, 0.9):
+            expected = -np.log(sure) if share else -np.log1p(-sure)
+            assert float(judge(as_sure(one, sure))) == pytest.approx(expected, rel=1e-4)
+    # Tags that win and lose, each with its own confidence: only its own counts, and only the frames of the piece.
+    one_lost = eqx.tree_at(lambda s: s.said.step_m, seen, seen.said.step_m.at[:, 1].set(-seen.said.step_m[:, 1]))
+    sure = jnp.tile(jnp.array([0.8, 0.1]), (seen.said.confidence.shape[0], 1)).at[: SETTINGS.skip_frames + 1].set(0.5)
+    told = eqx.tree_at(lambda s: s.said.confidence, one_lost, sure)
+    weight = np.asarray(eqx.filter_jit(agreement)(told, SETTINGS, KEY).weight).sum(axis=1)
+    expected = np.average([-np.log(0.8), -np.log(0.9)], weights=weight)
+    assert float(judge(told)) == pytest.approx(expected, rel=1e-4)
+    slope = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.said.confidence, told, p)))(sure)
+    assert (np.asarray(slope)[SETTINGS.skip_frames + 1 :] * np.array([-1.0, 1.0]) >= 0).all()
+    assert not np.asarray(slope)[: SETTINGS.skip_frames + 1].any()
+    certain = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.said.confidence, told, p)))(jnp.zeros_like(sure))
+    assert bool(jnp.isfinite(certain).all())
 
 
 def test_future_agreement_outlines_the_moving_object() -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from ..geometry import pixel_rays, range_to_depth
 from ..recording import Recording, RecordingError, RecordingWarning
 from ..rf.reads import PhaseReads, RadioWindow
+from ..rf.rest import coherence_lost
 from ..rf.windows import host_reads, radio_windows, window_reads
 from ..tracer import Camera, Frame
 from .flow_cache import pair_flow
@@ -29,6 +30,9 @@ Antennas = tuple[int, ...] | Literal["all"] | None
 """Which antennas' reads are used, counted from 1; None is the one with the most."""
 
 _TRUTH_STD_M = 1e-3
+
+_PIECE_S = 0.5
+"""In pieces of this length a clip's reads are asked for motion."""
 
 _one_radio_at_a_time = threading.Lock()
 """XLA runs a call on a thread of the pool that its parts wait for: on two cores, two calls at once can wait for each other."""
@@ -232,28 +236,54 @@ def _true_range_m(recording: Recording, epc: str, antenna: int) -> np.ndarray:
 _window_reads = jax.jit(window_reads, static_argnums=(2, 3))
 
 
+def motion_heard(
+    recording: Recording, starts: Sequence[int], length: int, epcs: Sequence[str], antennas: Sequence[int]
+) -> np.ndarray:
+    """How much each clip's tags move, by their reads alone: (clips,), of the tag and antenna that tell most.
+
+    The mean over a clip's pieces of half a second of the coherence that reads, modulo pi, lose by taking the tag to rest
+    (`tagjax.rf.rest`): some 0.02 by noise where nothing moves, 0.2 to 0.6 where a hand waves.
+    """
+    time_s = recording.frame_time_s()
+    edges = np.arange(time_s[0], time_s[-1] + _PIECE_S, _PIECE_S)
+    most = np.zeros(len(starts))
+    for epc, antenna in itertools.product(epcs, antennas):
+        reads = recording.reads.select(epc)
+        lost = coherence_lost(reads[reads.antenna == antenna], edges, int(recording.time_ns[0]))
+        for number, start in enumerate(starts):
+            first, last = np.searchsorted(edges, time_s[[start, start + length - 1]], side="right") - 1
+            most[number] = max(most[number], lost[first : last + 1].mean())
+    return most
+
+
 class _ClipSource:
     """Every clip of `length` frames that starts on a multiple of `step`, as Grain's random access source.
 
-    Warns (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for those of which no clip can be
+    Of these only clips in which the radio hears some tag move, by `least_motion` or more (`motion_heard`). Warns
+    (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for those of which no clip can be
     loaded, which would else be found when the first one is drawn.
     """
 
-    def __init__(self, recordings: Sequence[Recording], length: int, step: int, on_host: bool, **settings: Any):
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        length: int,
+        step: int,
+        on_host: bool,
+        least_motion: float = 0.0,
+        **settings: Any,
+    ):
         self._recordings, self._length, self._settings = list(recordings), length, settings
         self._on_host = on_host  # NumPy arrays, which one process can hand to another
-        self._places = [
-            (number, start)
-            for number, recording in enumerate(recordings)
-            for start in range(0, recording.num_frames - length + 1, step)
-        ]
-        if not self._places:
+        self._places: list[tuple[int, int]] = []
+        if all(recording.num_frames < length for recording in recordings):
             longest = max((recording.num_frames for recording in recordings), default=0)
             raise RecordingError(
                 f"No clip of {length} frames in {len(self._recordings)} recordings (the longest has {longest} frames). "
                 "Ask for shorter clips or give longer recordings."
             )
-        for recording in recordings:
+        most_heard = 0.0
+        for number, recording in enumerate(recordings):
             if recording.num_frames < length:
                 warnings.warn(
                     f"{recording.name} has {recording.num_frames} frames, fewer than a clip's {length}: it gives no clip. "
@@ -267,6 +297,16 @@ class _ClipSource:
             if settings["estimator"] == "truth":
                 for epc, antenna in itertools.product(named, chosen):
                     _true_range_m(recording, epc, antenna)
+            starts = range(0, recording.num_frames - length + 1, step)
+            heard = motion_heard(recording, starts, length, named, chosen)
+            self._places += [(number, start) for start, h in zip(starts, heard, strict=True) if h >= least_motion]
+            most_heard = max(most_heard, float(heard.max()))
+        if not self._places:
+            raise RecordingError(
+                f"In no clip of {length} frames is a tag heard to move by {least_motion} or more (the most is "
+                f"{most_heard:.3f}; noise alone makes about 0.02): there is nothing to learn motion from. Give recordings "
+                "in which tags move and are read, or set data.clips.least_motion lower."
+            )
 
     def __len__(self) -> int:
         return len(self._places)
@@ -295,13 +335,14 @@ def clip_dataset(
     antennas: Antennas = None,
     colour: bool = False,
     step: int | None = None,
+    least_motion: float = 0.0,
     workers: int = 0,
     share: tuple[int, int] = (0, 1),
 ) -> Stream:
     """An endless, shuffled stream of clips; the same seed gives the same order.
 
-    Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None).
-    With `workers` as many processes load them, radio included, and this one only takes them to its device; `share`
+    Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None);
+    those in which no tag is heard to move by `least_motion` (`motion_heard`) are not drawn. With `workers` as many processes load them, radio included, and this one only takes them to its device; `share`
     (i, n) is every n-th clip from the i-th on. Warns (`RecordingWarning`) of recordings shorter than a clip; raises
     `RecordingError` if all are, and for an unknown EPC or antenna of any other; `ValueError` for settings that no clip
     can have.
@@ -315,6 +356,7 @@ def clip_dataset(
         clip_length,
         step or max(1, clip_length // 2),
         workers > 0,
+        least_motion,
         stride=stride,
         epcs=epcs,
         flow=flow,

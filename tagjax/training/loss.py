@@ -14,6 +14,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._numerics import safe_divide
@@ -32,6 +33,7 @@ class ObjectiveSettings:
     area: float = 0.0  # weak priors, which know nothing of the tag: of the mask's share of the picture,
     compactness: float = 0.0  # of its spread in 3D, m^2,
     steadiness: float = 0.0  # and of what changes of it along the flow
+    calibration: float = 0.0  # of the confidence: how often a mask's motion does explain the reads best
     evidence: Literal["coherence", "likelihood"] = "coherence"  # of the contrast
     temperature: float = 0.1  # of the contrast, in units of coherence; of the likelihood in nats
     flip_share: float = 0.05  # of the likelihood: reads that are off by pi
@@ -144,14 +146,18 @@ def distance_at(
     return jnp.interp(query_s, frame_time_s, distance)
 
 
+def _piece_frames(num_frames: int, settings: ObjectiveSettings) -> tuple[np.ndarray, int]:
+    """The frames at which a clip's pieces begin, and how many later each ends; pieces overlap by half."""
+    span = min(settings.span_frames, num_frames - 1)
+    skip = min(settings.skip_frames, num_frames - 1 - span)
+    return np.arange(skip, num_frames - span, max(span // 2, 1)), span
+
+
 def _pieces(
     frame_time_s: Float[Array, " time"], reads: PhaseReads, settings: ObjectiveSettings
 ) -> Bool[Array, "tag piece reads"]:
-    """Which reads belong to which piece of the clip; pieces overlap by half."""
-    num_frames = frame_time_s.shape[0]
-    span = min(settings.span_frames, num_frames - 1)
-    skip = min(settings.skip_frames, num_frames - 1 - span)
-    starts = jnp.arange(skip, num_frames - span, max(span // 2, 1))
+    """Which reads belong to which piece of the clip."""
+    starts, span = _piece_frames(frame_time_s.shape[0], settings)
     begin, end = frame_time_s[starts][None, :, None], frame_time_s[starts + span][None, :, None]
     time_s = reads.time_s[:, None]
     inside = (time_s > begin) & (time_s <= end) & reads.valid[:, None]
@@ -167,6 +173,22 @@ class Agreement(eqx.Module):
     still: Float[Array, "tag piece"]  # own reads with no motion at all
     own_coherence: Float[Array, "tag piece"]  # whatever the evidence: own reads with own motion, 0 to 1
     weight: Float[Array, "tag piece"]  # how much the piece can tell: 0 for a tag that rests or is not read
+
+    def own(self) -> Float[Array, "tag piece"]:
+        """Own reads with the own mask's motion."""
+        return jnp.einsum("iip->ip", self.between)
+
+    def candidates(self) -> Float[Array, "tag candidate piece"]:
+        """`own`, and after it every other pairing that a tag's reads or motion enter; minus infinity where there is none."""
+        same = jnp.eye(self.between.shape[0], dtype=bool)[:, :, None]
+        others = jnp.where(same, -jnp.inf, self.between)
+        return jnp.concatenate(
+            [self.own()[:, None], others, jnp.swapaxes(others, 0, 1), self.altered, self.still[:, None]], axis=1
+        )
+
+    def mean(self, values: Float[Array, "tag piece"]) -> Float[Array, ""]:
+        """Over the pieces, each as much as it can tell; 0 where none tells anything."""
+        return safe_divide(jnp.sum(values * self.weight), jnp.sum(self.weight))
 
 
 def agreement(seen: Seen, settings: ObjectiveSettings, key: Array) -> Agreement:
@@ -235,23 +257,31 @@ def contrast(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float
     motion shifted in time, mirrored, or at rest. Pieces weigh as much as their tag moves.
     """
     found = agreement(seen, settings, key)
-    num_tags = found.between.shape[0]
-    own = jnp.einsum("iip->ip", found.between)
-    other = jnp.eye(num_tags, dtype=bool)[:, :, None]
-    masked = jnp.where(other, -jnp.inf, found.between)
-    candidates = jnp.concatenate(
-        [own[:, None], masked, jnp.swapaxes(masked, 0, 1), found.altered, found.still[:, None]], axis=1
-    )
+    candidates, own = found.candidates(), found.own()
     loss = jax.nn.logsumexp(candidates / settings.temperature, axis=1) - own / settings.temperature
-    weight = found.weight
-    mean = lambda values: safe_divide(jnp.sum(values * weight), jnp.sum(weight))  # noqa: E731
-    best = jnp.max(candidates[:, 1:], axis=1)
-    return mean(loss), {
-        "own_coherence": mean(found.own_coherence),
-        "ahead": mean(own - best),
-        "own_wins": mean((own > best).astype(own.dtype)),
-        "moving": jnp.mean(weight),
+    ahead = own - jnp.max(candidates[:, 1:], axis=1)
+    return found.mean(loss), {
+        "own_coherence": found.mean(found.own_coherence),
+        "ahead": found.mean(ahead),
+        "own_wins": found.mean((ahead > 0).astype(ahead.dtype)),
+        "moving": jnp.mean(found.weight),
     }
+
+
+def calibration(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Logarithmic score of the confidence in each piece as a forecast of whether the own mask's motion explains it best.
+
+    A proper score (Good, 1952), least where of the pieces with confidence p a share p is won: contrast and coverage are blind to the
+    scale of the log odds, of which the cut takes what is near the best. What is won carries no gradient.
+    """
+    found = agreement(seen, settings, key)
+    starts, span = _piece_frames(seen.frames.time_s.shape[0], settings)
+    confidence = seen.said.confidence[starts[:, None] + np.arange(1, span + 1)].mean(axis=1).T
+    confidence = jnp.tile(confidence, (1, seen.reads.valid.shape[1]))  # every antenna has these pieces
+    sure = jnp.clip(confidence, 1e-6, 1.0 - 1e-6)
+    won = found.own() > jnp.max(found.candidates()[:, 1:], axis=1)
+    score = -jnp.where(won, jnp.log(sure), jnp.log1p(-sure))
+    return found.mean(score), {"confidence": found.mean(confidence)}
 
 
 def coverage(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
@@ -378,6 +408,7 @@ TERMS: Mapping[str, Term] = {
     "area": area,
     "compactness": compactness,
     "steadiness": steadiness,
+    "calibration": calibration,
 }
 """The terms of the objective by name; `ObjectiveSettings` has a weight of each name."""
 

@@ -134,6 +134,7 @@ def _train(
             clip_length=clips.length,
             seed=config.seed,
             epcs=clips.epcs,
+            least_motion=clips.least_motion,
             workers=clips.workers,
             share=(jax.process_index(), jax.process_count()),
             colour=config.joint is not None,
