@@ -15,6 +15,18 @@ import yaml
 
 from tagjax.attention import coherent_score
 from tagjax.config import from_mapping
+from tagjax.evaluation.real_tags import (
+    SCORES,
+    Speeds,
+    Walk,
+    align,
+    associate,
+    heard_speed,
+    load_tagged,
+    places_around,
+    speed_scores,
+    speed_windows,
+)
 from tagjax.evaluation.tracks import (
     METHODS,
     Scene,
@@ -24,7 +36,9 @@ from tagjax.evaluation.tracks import (
     load_kinect,
     load_scenes,
     load_xovis,
+    real_tags_markdown,
     right,
+    run_real_tags,
     run_tracks,
     windows,
 )
@@ -60,7 +74,6 @@ def folder(tmp_path_factory) -> Path:
             text = stamp.strftime("%Y-%m-%d %H:%M:%S") + f":{stamp.microsecond // 1000:03d}"
             lines.append(f"7{number}, {text}, {100 * x}, {100 * z}")
         (home / "kinect-rfid" / f"{number + 1}-5-2020.txt").write_text("\n".join(lines) + "\n")
-    (home / "kinect-rfid" / "RFID_1-5-2020.txt").write_text("no track\n")
     (home / "xovis-uwb").mkdir()
     rows = [";time;id;x;y;height;cam"]
     for number, path in enumerate(paths[:2]):
@@ -183,7 +196,7 @@ def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path)
         assert set(row["accuracy"]) == set(METHODS)
         assert min(row["accuracy"].values()) == 1.0, row
         assert row["chance"] == pytest.approx(1 / row["candidates"])
-    assert json.loads((tmp_path / "metrics.json").read_text()) == rows
+    assert json.loads((tmp_path / "metrics.json").read_text()) == {"virtual_tags": rows}  # no real tags beside them
     assert (tmp_path / "accuracy.png").stat().st_size > 0
     assert "| kinect-rfid | 4 | 6 |" in (tmp_path / "tables.md").read_text()
 
@@ -195,3 +208,144 @@ def test_real_tracks_tell_the_carrier_better_the_longer_one_looks(real_data, tmp
     assert {row["scene"] for row in rows} == {"kinect-rfid", "xovis-uwb"}
     for row in rows:
         assert row["accuracy"][METHODS[0]] > row["chance"]
+
+
+ANTENNA_M, SCALE = np.array([4.5, 0.75]), 0.3
+LAGS_S = (3.2, -6.5)
+
+
+def _lines(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _stamped(second: float) -> str:
+    stamp = datetime(2020, 5, 1, 12, 0, 0) + timedelta(seconds=float(second))
+    return stamp.strftime("%Y-%m-%d %H:%M:%S") + f":{stamp.microsecond // 1000:03d}"
+
+
+@pytest.fixture(scope="module")
+def tagged_folder(tmp_path_factory) -> Path:
+    """Two recordings of 30 s: in each one walks with a tag; in the second somebody else walks, too."""
+    home = tmp_path_factory.mktemp("tagged")
+    (home / "kinect-rfid").mkdir()
+    rng = np.random.default_rng(0)
+    time_s = np.arange(0.0, 30.0, 1 / 30)
+    wave = lambda *hz: sum(np.sin(2 * np.pi * f * time_s + 1.7 * i) for i, f in enumerate(hz)) / len(hz)  # noqa: E731
+    carriers = (
+        np.stack([3.5 + 0.8 * wave(0.11, 0.23), 2.2 + 0.9 * wave(0.09, 0.17)], axis=1),
+        np.stack([4.2 + 0.9 * wave(0.13, 0.19), 3.0 + 0.8 * wave(0.08, 0.21)], axis=1),
+    )
+    other = np.stack([4.0 + 0.9 * wave(0.15, 0.07), 2.0 + 0.7 * wave(0.12, 0.26)], axis=1)
+    for number, (carrier, lag_s) in enumerate(zip(carriers, LAGS_S, strict=True)):
+        name = f"{number + 1}-5-2020.txt"
+        walks = {f"7{number}": carrier} | ({"99": other} if number else {})
+        begin = 1000.0 * number
+        _lines(
+            home / "kinect-rfid" / name,
+            [
+                f"{who}, {_stamped(begin + t)}, {100 * x}, {100 * z}"
+                for who, walk in walks.items()
+                for t, (x, z) in zip(time_s, walk, strict=True)
+            ],
+        )
+        towards = -np.gradient(np.linalg.norm(carrier - ANTENNA_M, axis=1), time_s)
+        read_s = np.sort(rng.uniform(0.0, 30.0, 900))
+        speed = SCALE * np.interp(read_s, time_s, towards) + 0.1 * rng.normal(size=900)
+        _lines(
+            home / "kinect-rfid" / f"RFID_{name}",
+            [f"0000 001E,{v},nan,{v},{_stamped(begin + t - lag_s)}" for t, v in zip(read_s, speed, strict=True)],
+        )
+    return home
+
+
+def test_a_tag_s_speed_at_a_time_is_that_of_the_reads_around_it():
+    speeds = Speeds(np.concatenate([np.arange(0, 4, 0.02), [9.0]]), np.concatenate([np.full(200, 0.7), [5.0]]))
+    heard = heard_speed(speeds, np.array([1.0, 2.0, 6.0, 9.0]))
+    np.testing.assert_allclose(heard[:2], 0.7)
+    assert np.isnan(heard[2:]).all()  # none near, and one alone
+
+
+def test_the_antenna_and_the_clocks_come_out_of_a_tag_s_speeds(tagged_folder):
+    first, second = load_tagged(tagged_folder / "kinect-rfid", RATE_HZ)
+    assert [one.epc for one in (first, second)] == ["0000 001E"] * 2
+    assert [len(one.walks) for one in (first, second)] == [1, 2]
+    places = places_around([*first.walks, *second.walks])
+    alone = align([(first.walks[0], first.speeds)], places)[0]
+    assert alone.lag_s == pytest.approx(LAGS_S[0], abs=0.1)
+    np.testing.assert_allclose(alone.antenna_m, ANTENNA_M, atol=0.4)
+    assert alone.slope == pytest.approx(SCALE, abs=0.04)
+    together = align([(one.walks[0], one.speeds) for one in (first, second)], places)
+    assert together[0].antenna_m == together[1].antenna_m
+    np.testing.assert_allclose(together[0].antenna_m, ANTENNA_M, atol=0.2)
+    np.testing.assert_allclose([one.lag_s for one in together], LAGS_S, atol=0.1)
+    # At that place a correlation is NumPy's own over the frames that both cover.
+    (given,) = align([(first.walks[0], first.speeds)], ANTENNA_M[None])
+    heard = heard_speed(first.speeds, first.walks[0].time_s - given.lag_s)
+    seen = first.walks[0].towards_m_s(ANTENNA_M)
+    both = np.isfinite(heard)
+    assert given.correlation == pytest.approx(np.corrcoef(heard[both], seen[both])[0, 1], abs=2e-3)
+    assert given.slope == pytest.approx(np.polyfit(seen[both], heard[both], 1)[0], rel=0.01)
+    still = Walk("still", first.walks[0].time_s, np.zeros_like(first.walks[0].position_m))
+    assert align([(still, first.speeds)], ANTENNA_M[None])[0].correlation == 0.0
+
+
+def test_real_tags_are_told_by_antennas_that_other_recordings_place(tagged_folder, tmp_path):
+    found = associate(load_tagged(tagged_folder / "kinect-rfid", RATE_HZ))
+    for one, lag_s in zip(found, LAGS_S, strict=True):
+        assert one.carrier == 0
+        np.testing.assert_allclose(one.found[0].antenna_m, ANTENNA_M, atol=0.4)
+        assert one.found[0].lag_s == pytest.approx(lag_s, abs=0.1)
+        assert one.found[0].correlation > 0.85 > max(other.correlation for other in one.found[1:]) + 0.1
+    assert [len(one.candidates) for one in found] == [3, 3]
+    windows_4s = [window for one in found for window in speed_windows(one, 4.0, 0.16)]
+    assert len(windows_4s) > 8
+    for window in windows_4s:
+        assert window.distance_m.shape == (3, 60)
+        assert np.isfinite(window.towards_m_s).all()
+        scores = speed_scores(window)
+        straight = np.corrcoef(window.distance_m[1], -np.cumsum(window.towards_m_s))[0, 1]
+        assert scores["Tagview, R^2"][1] == pytest.approx(max(straight, 0.0) ** 2, abs=1e-9)
+    config = TracksConfig(str(tagged_folder), windows_s=(1.0, 4.0), frame_rate_hz=RATE_HZ)
+    real = run_real_tags(config, tmp_path, lambda name: None)
+    short, long = real["real_tags"]
+    for name in SCORES:
+        assert long["accuracy"][name] >= short["accuracy"][name] - 0.05
+        assert long["accuracy"][name] > 0.8 > long["chance"] + 0.4
+    assert (tmp_path / "real_tags.png").stat().st_size > 0
+    text = real_tags_markdown(real)
+    assert "| 2-5-2020 |" in text
+    assert "|  |  |  | ...99 |" in text
+    assert "...70, of another recording" in text
+    assert run_real_tags(TracksConfig(str(tmp_path)), tmp_path, print) == {}
+    assert real_tags_markdown({}) == ""
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("001E,1,2,3\n", r"line 1: not enough values.*Expected EPC"),
+        ("001E,1,2,fast,2020-05-01 12:00:00:000\n", "line 1: could not convert"),
+        ("001E,1,2,nan,2020-05-01 12:00:00:000\n", "line 1: the speed is nan"),
+        ("001E,1,2,0.3,noon\n", "line 1: time data"),
+    ],
+)
+def test_speeds_that_are_none_are_named(tmp_path, line, message):
+    (tmp_path / "1.txt").write_text("7, 2020-05-01 12:00:00:000, 1, 2\n7, 2020-05-01 12:00:01:000, 2, 2\n")
+    (tmp_path / "RFID_1.txt").write_text(line)
+    with pytest.raises(RecordingError, match=message):
+        load_tagged(tmp_path, RATE_HZ)
+    (tmp_path / "1.txt").write_text("7, 2020-05-01 12:00:00:000, 1, 2\n")
+    with pytest.raises(RecordingError, match="no track of two samples"):
+        load_tagged(tmp_path, RATE_HZ)
+
+
+@pytest.mark.real_data
+def test_real_tags_are_carried_by_who_walks_as_they_do(real_data):
+    """Three recordings of other days agree on where the antenna stood, and each tag's carrier suits it best by far."""
+    found = associate(load_tagged(real_data / "tracks" / "kinect-rfid", RATE_HZ))
+    assert [one.carrier for one in found] == [0, 0, 0]
+    for one in found:
+        best, *others = sorted((each.correlation for each in one.found), reverse=True)
+        assert best == one.found[0].correlation > 0.8
+        assert max(others) < 0.7
+        np.testing.assert_allclose(one.found[0].antenna_m, [4.4, 0.9], atol=0.4)
