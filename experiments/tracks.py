@@ -1,4 +1,4 @@
-"""Which of several real tracks carries a (virtual) tag: accuracy of every method's association score by window length.
+"""Which of several real tracks carries a tag, virtual or real: accuracy of every method's association score by window length.
 
 python -m experiments.tracks folder=<folder with kinect-rfid/ and xovis-uwb/>
 python -m experiments.tracks folder=<...> 'windows_s=[2,4]' most=10 noise_m=0.05

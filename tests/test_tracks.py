@@ -23,6 +23,7 @@ from tagjax.evaluation.real_tags import (
     associate,
     heard_speed,
     load_tagged,
+    load_uwb,
     places_around,
     speed_scores,
     speed_windows,
@@ -320,6 +321,36 @@ def test_real_tags_are_told_by_antennas_that_other_recordings_place(tagged_folde
     assert real_tags_markdown({}) == ""
 
 
+def test_a_uwb_tag_s_positions_become_speeds_towards_a_place(tmp_path):
+    """Positions in a frame of their own: turned, and stamped by another clock."""
+    time_s = np.arange(0.0, 70.0, 0.2)
+    path = np.stack([3.0 + np.sin(0.5 * time_s) + 0.5 * np.sin(1.1 * time_s), 2.0 + np.cos(0.7 * time_s)], axis=1)
+    other = np.stack([3.0 + np.sin(0.37 * time_s) + 0.6 * np.sin(1.7 * time_s), 2.0 + np.cos(1.3 * time_s)], axis=1)
+    rows = [";time;id;x;y;height;cam"]
+    for who, walk in (("11", path), ("12", other), ("13", path[:20])):
+        rows += [
+            f"0;{1e3 * (500 + t)};{who};{x / 0.02};{y / 0.02};1;c" for t, (x, y) in zip(time_s, walk, strict=False)
+        ]
+    _lines(tmp_path / "raw_xovis.csv", rows)
+    assert load_uwb(tmp_path, RATE_HZ, 0.02) == []
+    noise = 0.05 * np.random.default_rng(1).normal(size=path.shape)
+    turned = (path + noise) @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + np.array([5.0, -1.0])
+    pairs = [";XOVIS_TIME;UWB_TIME;UWB_X;UWB_Y;XOVIS_X;XOVIS_Y;XOVIS_PERSON_ID"]
+    pairs += [f"0;0;{1e3 * (500.7 + t)};{1e3 * x};{1e3 * y};0;0;11" for t, (x, y) in zip(time_s, turned, strict=True)]
+    _lines(tmp_path / "XOVIS_UWB.csv", pairs)
+    (tagged,) = load_uwb(tmp_path, RATE_HZ, 0.02)
+    assert [walk.name for walk in tagged.walks] == ["11", "12"]  # the third is too short
+    assert tagged.carrier == "11"
+    (found,) = associate([tagged])
+    assert found.carrier == 0
+    assert found.own.lag_s == pytest.approx(-0.7, abs=0.15)
+    assert found.own.correlation > 0.95 > found.found[1].correlation + 0.3
+    assert [one["carrier"] for one in found.plain()["candidates"]] == [True, False]
+    _lines(tmp_path / "XOVIS_UWB.csv", [";UWB_TIME;UWB_X"])
+    with pytest.raises(RecordingError, match="columns UWB_Y, XOVIS_PERSON_ID are missing"):
+        load_uwb(tmp_path, RATE_HZ, 0.02)
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -349,3 +380,6 @@ def test_real_tags_are_carried_by_who_walks_as_they_do(real_data):
         assert best == one.found[0].correlation > 0.8
         assert max(others) < 0.7
         np.testing.assert_allclose(one.found[0].antenna_m, [4.4, 0.9], atol=0.4)
+    uwb = associate(load_uwb(real_data / "tracks" / "xovis-uwb", RATE_HZ, 0.02))
+    assert [one.candidates[one.carrier].name for one in uwb] == [one.tagged.carrier for one in uwb]
+    assert all(one.found[one.carrier].correlation > 0.8 for one in uwb)

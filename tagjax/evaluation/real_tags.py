@@ -1,12 +1,14 @@
-"""Real tags on real people: the radial speeds that a reader made of phases, beside the tracks of a depth camera.
+"""Real tags on real people: how fast a tag came nearer, by a reader or a UWB receiver, beside the tracks of a depth camera.
 
-Such recordings (`kinect-rfid`) tell neither where the antenna stood nor how far apart the two clocks are, and file speeds, not
-phases. So a speed is compared with a track's speed towards an antenna whose place comes from the other recordings, at the
-clock offset that suits the track best, and by scores that ask for no scale.
+`kinect-rfid` holds radial speeds that a reader made of phases, `xovis-uwb` a UWB tag's positions, of which the distance to a
+place is taken. Neither tells where that place is among the tracks, nor how far apart the two clocks are, nor are there phases. So a speed is
+compared with a track's speed towards a place that comes from the other recordings, at the clock offset that suits the track
+best, and by scores that ask for no scale.
 """
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -31,6 +33,8 @@ Eq. 4, TagVision and coherence need distances to scale or raw phases, Goller et 
 
 _NUM_WINDOW = 5  # TagAttention's k
 _SMOOTH_S = 0.2  # of positions and speeds: reads come some 30 a second, with 0.15 m/s of noise each
+_SMOOTH_UWB_S = 0.5  # of UWB positions: five a second, off by some decimetres
+_LEAST_TRACK_S, _LEAST_OTHER_S = 60.0, 5.0  # of a UWB tag's own tracks, and of those beside
 _LEAST_READS = 2.0  # within the smoothing, for a speed to be known
 _LONGEST_LAG_S = 20.0
 _LAG_STEP_S = 0.1
@@ -71,6 +75,7 @@ class TaggedRecording:
     walks: tuple[Walk, ...]
     epc: str
     speeds: Speeds
+    carrier: str | None = None  # the track's name, where it is known
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,6 +141,67 @@ def load_tagged(folder: Path, rate_hz: float) -> list[TaggedRecording]:
             moved = dataclasses.replace(speeds, time_s=speeds.time_s - start)
             found.append(TaggedRecording(path.stem, walks, epc, moved))
     return found
+
+
+def read_xovis(path: Path, unit_m: float) -> Rows:
+    """The tracks of a table ;time;id;x;y;... (ms; x and y in units of `unit_m`). Raises `RecordingError` for others."""
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for row in _table(path, {"time", "id", "x", "y"}):
+        place = float(row["x"]) * unit_m, float(row["y"]) * unit_m
+        rows.setdefault(row["id"], []).append((float(row["time"]) * 1e-3, *place))
+    return rows
+
+
+def _table(path: Path, columns: set[str]) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        table = csv.DictReader(file, delimiter=";")
+        missing = columns - set(table.fieldnames or ())
+        if missing:
+            raise RecordingError(f"{path}: columns {', '.join(sorted(missing))} are missing; found {table.fieldnames}.")
+        return list(table)
+
+
+def load_uwb(folder: Path, rate_hz: float, unit_m: float) -> list[TaggedRecording]:
+    """A UWB tag beside stereo tracks, one recording for each track that `XOVIS_UWB.csv` gives it to for long; none without that file.
+
+    Its speed is that of its distance to a place a metre before its floor, of positions smoothed over half a second.
+    """
+    paired = folder / "XOVIS_UWB.csv"
+    if not paired.is_file():
+        return []
+    rows = _table(paired, {"UWB_TIME", "UWB_X", "UWB_Y", "XOVIS_PERSON_ID"})
+    path = np.array([[float(row[name]) * 1e-3 for name in ("UWB_TIME", "UWB_X", "UWB_Y")] for row in rows])
+    path = path[np.unique(path[:, 0], return_index=True)[1]]
+    tracks = {who: np.array(own) for who, own in read_xovis(folder / "raw_xovis.csv", unit_m).items()}
+    found = []
+    for who in dict.fromkeys(row["XOVIS_PERSON_ID"] for row in rows):
+        if who not in tracks or np.ptp(tracks[who][:, 0]) < _LEAST_TRACK_S:
+            continue
+        begin, end = tracks[who][0, 0], tracks[who][-1, 0]
+        there = [own for name, own in tracks.items() if name == who or (own[0, 0] < end and own[-1, 0] > begin)]
+        names = [name for name, own in tracks.items() if any(own is one for one in there)]
+        origin = np.array([begin, 0.0, 0.0])
+        walks = {
+            name: _walk(name, own - origin, rate_hz)
+            for name, own in zip(names, there, strict=True)
+            if np.ptp(own[:, 0]) >= _LEAST_OTHER_S
+        }
+        speeds = _speeds_of_path(path[(path[:, 0] > begin) & (path[:, 0] < end)] - origin)
+        found.append(TaggedRecording(f"xovis-uwb {who}", tuple(walks.values()), "uwb", speeds, who))
+    return found
+
+
+def _speeds_of_path(path: Float[np.ndarray, "samples 3"]) -> Speeds:
+    """Speeds towards a place a metre before the floor that a path (s, x, y in metres) covers."""
+    low, high = path[:, 1:].min(axis=0), path[:, 1:].max(axis=0)
+    place = np.array([low[0] - 1.0, 0.7 * low[1] + 0.3 * high[1]])
+    clock = np.arange(path[0, 0], path[-1, 0], 0.05)
+    weight = np.exp(-0.5 * np.square((clock[:, None] - path[None, :, 0]) / _SMOOTH_UWB_S))
+    count = weight.sum(axis=1)
+    smooth = weight @ path[:, 1:] / np.maximum(count, 1e-9)[:, None]
+    speed = -np.gradient(np.linalg.norm(smooth - place, axis=1), clock)
+    known = count >= _LEAST_READS
+    return Speeds(clock[known], speed[known])
 
 
 def _walk(name: str, rows: Float[np.ndarray, "samples 3"], rate_hz: float) -> Walk:
@@ -250,7 +316,12 @@ class Association:
             "antenna_m": list(self.found[0].antenna_m),
             "own_antenna_m": list(self.own.antenna_m),
             "candidates": [
-                {"track": walk.name, "own": number < here, **dataclasses.asdict(one)}
+                {
+                    "track": walk.name,
+                    "own": number < here,
+                    "carrier": None if self.tagged.carrier is None else walk.name == self.tagged.carrier,
+                    **dataclasses.asdict(one),
+                }
                 for number, (walk, one) in enumerate(zip(self.candidates, self.found, strict=True))
             ],
         }

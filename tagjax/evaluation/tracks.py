@@ -7,7 +7,6 @@ noise of its own, so that the carrier's is not the tag's path to the letter. Whe
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from ..rf.windows import phase_reads, radio_windows
 from ..sim.reader import ReaderSettings
 from ..sim.virtual_tag import Track, virtual_reads
 from ..viz.tracks import accuracy_plot, speeds_plot
-from .real_tags import SCORES, associate, load_tagged, read_kinect, speed_scores, speed_windows
+from .real_tags import SCORES, associate, load_tagged, load_uwb, read_kinect, read_xovis, speed_scores, speed_windows
 from .report import write_json
 
 METHODS = (
@@ -110,16 +109,8 @@ def load_kinect(folder: Path, rate_hz: float) -> Scene:
 
 def load_xovis(path: Path, rate_hz: float, unit_m: float) -> Scene:
     """All tracks of a table ;time;id;x;y;... (ms; x and y in units of `unit_m`), put side by side."""
-    rows: dict[str, list[tuple[float, float, float]]] = {}
-    with path.open(newline="") as file:
-        table = csv.DictReader(file, delimiter=";")
-        missing = {"time", "id", "x", "y"} - set(table.fieldnames or ())
-        if missing:
-            raise RecordingError(f"{path}: columns {', '.join(sorted(missing))} are missing; found {table.fieldnames}.")
-        for row in table:
-            place = float(row["x"]) * unit_m, float(row["y"]) * unit_m
-            rows.setdefault(row["id"], []).append((float(row["time"]) * 1e-3, *place))
-    tracks = [(np.array(own)[:, 0], np.array(own)[:, 1:]) for own in rows.values() if len(own) > 1]
+    each = [np.array(own) for own in read_xovis(path, unit_m).values() if len(own) > 1]
+    tracks = [(own[:, 0], own[:, 1:]) for own in each]
     if len(tracks) < 2:
         raise RecordingError(f"{path}: {len(tracks)} tracks; association needs two or more.")
     return _scene("xovis-uwb", tracks, rate_hz)
@@ -269,19 +260,26 @@ def run_tracks(config: TracksConfig, folder: Path, *, on_done: Callable[[str], N
 
 
 def run_real_tags(config: TracksConfig, folder: Path, on_done: Callable[[str], None]) -> dict[str, Any]:
-    """Who carries the real tags of `kinect-rfid`, by whole recordings and by windows; nothing where there are none."""
-    tagged = load_tagged(Path(config.folder) / "kinect-rfid", config.frame_rate_hz)
-    if not tagged:
+    """Who carries the real tags of the folder, by whole recordings and by windows; nothing where there are none."""
+    home, rows, whole = Path(config.folder), [], []
+    scenes = {
+        "kinect-rfid": load_tagged(home / "kinect-rfid", config.frame_rate_hz),
+        "xovis-uwb": load_uwb(home / "xovis-uwb", config.frame_rate_hz, config.xovis_unit_m),
+    }
+    for name, tagged in scenes.items():
+        if not tagged:
+            continue
+        on_done(f"{name}, real tags")
+        found = associate(tagged)
+        whole += found
+        for length_s in config.windows_s:
+            seen = [window for one in found for window in speed_windows(one, length_s, config.least_move_m)]
+            scored = ((len(one.distance_m), one.carrier, speed_scores(one)) for one in seen)
+            rows += _accuracy(name, length_s, SCORES, scored)
+    if not whole:
         return {}
-    on_done("real tags")
-    found = associate(tagged)
-    rows = []
-    for length_s in config.windows_s:
-        seen = [window for one in found for window in speed_windows(one, length_s, config.least_move_m)]
-        scored = ((len(one.distance_m), one.carrier, speed_scores(one)) for one in seen)
-        rows += _accuracy("kinect-rfid", length_s, SCORES, scored)
-    speeds_plot(folder / "real_tags.png", found)
-    return {"real_tags": rows, "real_tags_whole": [one.plain() for one in found]}
+    speeds_plot(folder / "real_tags.png", whole)
+    return {"real_tags": rows, "real_tags_whole": [one.plain() for one in whole]}
 
 
 def _accuracy(
@@ -335,10 +333,11 @@ def real_tags_markdown(real: Mapping[str, Any]) -> str:
         return ""
     lines = [
         "",
-        "Real tags: correlation of the speeds that the reader filed with each track's towards the antenna, over the whole",
-        "recording, at the clock offset that suits the track best. The antenna stands where the other recordings put it.",
+        "Real tags: correlation of the speeds that were measured with each track's towards the antenna, over the whole",
+        "recording, at the clock offset that suits the track best. The antenna (of a UWB tag, the place that its distances are",
+        "to) stands where the other recordings put it.",
         "",
-        "| recording | antenna by the others (m) | by its own track | track | correlation | clock offset (s) | filed / true speed |",
+        "| recording | antenna by the others (m) | by its own track | track | correlation | clock offset (s) | measured / track's speed |",
         "|---|---|---|---|---|---|---|",
     ]
     for one in real["real_tags_whole"]:
@@ -346,11 +345,12 @@ def real_tags_markdown(real: Mapping[str, Any]) -> str:
         for number, each in enumerate(one["candidates"]):
             first = [one["recording"], *places] if number == 0 else ["", "", ""]
             where = f"...{each['track'][-4:]}" + ("" if each["own"] else ", of another recording")
+            where += " (carries it)" if each["carrier"] else ""
             cells = [*first, where, f"{each['correlation']:.2f}", f"{each['lag_s']:.1f}", f"{each['slope']:.2f}"]
             lines.append("| " + " | ".join(cells) + " |")
     lines += [
         "",
-        "Share of windows in which the carrier scores highest, the clocks apart as its whole track says. Speeds are filed, not",
+        "Share of windows in which the carrier scores highest, the clocks apart as its whole track says. Speeds are known, not",
         "phases, and not to scale: coherence, TagVision and Eq. 4 cannot be asked, and Goller et al. need RSSI at several antennas.",
         "",
         "",

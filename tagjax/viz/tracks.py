@@ -51,7 +51,7 @@ def speeds_plot(path: Path, found: Sequence[Association]) -> None:
             heard,
             "k.",
             markersize=2.5,
-            label=f"tag, filed speed / {carrier.slope:.2f}",
+            label=f"tag, measured speed / {carrier.slope:.2f}",
         )
         axes.set_title(f"{one.tagged.name}: clocks {carrier.lag_s:.1f} s apart", fontsize=9, loc="left")
         axes.set_ylabel("towards antenna (m/s)", fontsize=8)
