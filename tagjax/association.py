@@ -61,7 +61,8 @@ def sinkhorn(
     A pair of score -inf is masked: share 0, gradient 0. A row or column without any pair goes to the dustbin with
     `unmatched_score` and takes no part without it (all its shares are 0), which is how padding is left out. Where the
     mask admits no complete assignment, give an `unmatched_score`: without it the columns' totals cannot all be met.
-    The rows' totals hold after any number of iterations, the columns' in the limit. One sample; vmap for more.
+    The rows' totals hold after any number of iterations, the columns' in the limit. One sample; vmap for more. Raises
+    `ValueError` for no iteration or a temperature that is not positive.
     """
     if num_iterations < 1:
         raise ValueError(f"num_iterations is {num_iterations}; expected at least 1.")

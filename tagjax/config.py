@@ -1,7 +1,7 @@
 """Typed schemas of every configuration, and the helpers that turn plain dictionaries into them.
 
-YAML under conf/ is the one home of tunables: a schema names what may be set and of which type, and an unknown or
-mistyped key is refused. Real alternatives are named by `_target_` and built by `build`, which reaches no further
+YAML under conf/ is the home of a run's tunables: a schema names what may be set and of which type, and an unknown or
+mistyped key is refused. Its own defaults are those of the YAML, but for the training of flow networks. Real alternatives are named by `_target_` and built by `build`, which reaches no further
 than this package and Optax.
 """
 

@@ -336,7 +336,7 @@ class Recording:
                 gap_s = (int(self.reads.time_ns[0]) - int(self.time_ns[0])) * 1e-9
                 raise RecordingError(
                     f"{self.name}: no read falls between the first and the last frame (first read {gap_s:+.1f} s from the "
-                    "first frame). Reader and camera clocks differ: import with clock=arrival or give clock_offset_s."
+                    "first frame). Reader and camera clocks differ: import with clock=arrival, or with clock=<seconds to add to the reader's clock>."
                 )
 
     def check_has_depth(self) -> None:

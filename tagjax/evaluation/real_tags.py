@@ -126,7 +126,10 @@ def read_speeds(path: Path) -> dict[str, Speeds]:
 
 
 def load_tagged(folder: Path, rate_hz: float) -> list[TaggedRecording]:
-    """Every tag of every <name>.txt of tracks beside which there is a RFID_<name>.txt; times from the first track on."""
+    """Every tag of every <name>.txt of tracks beside which there is a RFID_<name>.txt; times from the first track on.
+
+    Raises `RecordingError` for files that hold other lines, or no track.
+    """
     found = []
     for path in sorted(folder.glob("[0-9]*.txt")):
         beside = path.with_name(f"RFID_{path.name}")
@@ -165,6 +168,7 @@ def load_uwb(folder: Path, rate_hz: float, unit_m: float) -> list[TaggedRecordin
     """A UWB tag beside stereo tracks, one recording for each track that `XOVIS_UWB.csv` gives it to for long; none without that file.
 
     Its speed is that of its distance to a place a metre before its floor, of positions smoothed over half a second.
+    Raises `RecordingError` for missing columns.
     """
     paired = folder / "XOVIS_UWB.csv"
     if not paired.is_file():

@@ -39,7 +39,7 @@ def run_evaluation(
     """Evaluate and return the report's summary, which is also written to `folder`.
 
     `run_values` is the configuration found in the run folder; what `config` leaves open is taken from it. Without
-    recordings the run's own held-out ones are used.
+    recordings the run's own held-out ones are used. Raises `ConfigError` where neither names a tracer or a recording.
     """
     clips, scores, baselines, recordings = ClipSettings(), ScoreSettings(), dict(config.baselines or {}), []
     estimators = dict(config.baseline_estimators or {})

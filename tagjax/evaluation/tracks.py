@@ -97,7 +97,10 @@ def _scene(name: str, tracks: Sequence[tuple[np.ndarray, np.ndarray]], rate_hz: 
 
 
 def load_kinect(folder: Path, rate_hz: float) -> Scene:
-    """All skeleton tracks of a folder (id, time, x cm, z cm), recorded one or two at a time, put side by side."""
+    """All skeleton tracks of a folder (id, time, x cm, z cm), recorded one or two at a time, put side by side.
+
+    Raises `RecordingError` for other lines and for fewer than two tracks.
+    """
     tracks = []
     for path in sorted(folder.glob("[0-9]*.txt")):
         each = [np.array(own) for own in read_kinect(path).values() if len(own) > 1]
@@ -108,7 +111,10 @@ def load_kinect(folder: Path, rate_hz: float) -> Scene:
 
 
 def load_xovis(path: Path, rate_hz: float, unit_m: float) -> Scene:
-    """All tracks of a table ;time;id;x;y;... (ms; x and y in units of `unit_m`), put side by side."""
+    """All tracks of a table ;time;id;x;y;... (ms; x and y in units of `unit_m`), put side by side.
+
+    Raises `RecordingError` for missing columns and for fewer than two tracks.
+    """
     each = [np.array(own) for own in read_xovis(path, unit_m).values() if len(own) > 1]
     tracks = [(own[:, 0], own[:, 1:]) for own in each]
     if len(tracks) < 2:

@@ -197,7 +197,11 @@ def radio_windows(
     estimator: Literal["robust", "paper"] = "robust",
     model: RadioModel | None = None,
 ) -> RadioWindow:
-    """Windowed distances by the named estimator; `model` None takes `radio_model(reads)`."""
+    """Distances over the last `num_window` frames by the named estimator: (time, window), metres from each window's first frame.
+
+    Their standard deviations are infinite where nothing is known. `model` None takes `radio_model(reads)`. Raises
+    `ValueError` for an unknown estimator.
+    """
     if estimator == "paper":
         return _paper_jit(reads, frame_time_s, num_window)
     if estimator != "robust":

@@ -58,7 +58,7 @@ def initial_network(settings: Mapping[str, Any], weights: str | None) -> Abstrac
 def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console | None = None) -> float:
     """Train as configured and return the mean end-point error on drawn validation pairs, pixels; NaN if interrupted.
 
-    `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.npz, which `flow=<path>` uses. An
+    `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.npz, which `data.clips.flow=<path>` uses. An
     interrupted run goes on from its newest checkpoint when started again in the same folder. Of several processes
     (`config.distributed`) only the first writes.
     """

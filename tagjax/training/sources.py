@@ -123,7 +123,7 @@ def with_virtual_tags(recording: Recording, settings: VirtualTagSettings) -> Rec
 
 
 def join_reads(parts: Sequence[TagReads]) -> TagReads:
-    """The reads of several tables in order of time. Their phase convention must be the same."""
+    """The reads of several tables in order of time. Raises `RecordingError` where their phase conventions differ."""
     first = parts[0]
     for part in parts[1:]:
         if (part.phase_period_rad, part.phase_sign) != (first.phase_period_rad, first.phase_sign):

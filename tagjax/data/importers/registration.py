@@ -169,7 +169,10 @@ def estimate_correction(
 
 
 def estimate_folder_correction(folder: str | Path, calibration: str | Path) -> ResidualCorrection:
-    """`estimate_correction` from `FOLDER_FRAMES` frames, evenly spread, of a folder that `import_jpg_mat` reads."""
+    """`estimate_correction` from `FOLDER_FRAMES` frames, evenly spread, of a folder that `import_jpg_mat` reads.
+
+    Raises `RecordingError` where there are no pictures, or they differ in size.
+    """
     pictures = in_order(Path(folder).glob("*.jpg"))
     if not pictures:
         raise RecordingError(f"{folder}: no .jpg file; expected pictures with .mat files of the same names.")

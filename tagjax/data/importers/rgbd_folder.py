@@ -129,7 +129,8 @@ def import_jpg_mat(
 
     The folder has no times: frames are stamped at `fps`. `correction` is a residual correction of the calibration
     (see `DepthToColour.corrected`), as `registration.estimate_correction` gives it. `masks` is a folder of label
-    pictures, one a frame. The recording has no tag reads.
+    pictures, one a frame. The recording has no tag reads. Raises `RecordingError` where pictures or their .mat files are
+    missing or differ in size.
     """
     folder = Path(folder)
     pictures = in_order(folder.glob("*.jpg"))
