@@ -2,6 +2,10 @@
 
 python -m experiments.tracks folder=<folder with kinect-rfid/ and xovis-uwb/>
 python -m experiments.tracks folder=<...> 'windows_s=[2,4]' most=10 noise_m=0.05
+
+Of kinect-rfid/ the files <date>.txt (skeletons) and RFID_<date>.txt (the reader's speeds) are read, of xovis-uwb/ the files
+raw_xovis.csv (stereo tracks) and XOVIS_UWB.csv (a UWB tag's positions and whose it is); either folder will do. One tag is put on each track,
+and the real tags' own are asked as well: tables.md, real_tags.png and metrics.json in the run folder.
 """
 
 from __future__ import annotations

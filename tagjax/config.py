@@ -46,6 +46,7 @@ class ClipSettings:
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
     least_motion: float = 0.1  # training clips in which no tag is heard to move by so much are not drawn; 0 draws all
+    most_tags: int | None = None  # of a training clip: the one that moves most, others by chance; all if None
     workers: int = 0  # processes that load training clips; with none a thread does
 
     def __post_init__(self) -> None:
@@ -54,6 +55,8 @@ class ClipSettings:
             raise ConfigError(f"length is {self.length}; expected at least the window's {self.window} frames.")
         if not 0 <= self.least_motion < 1:
             raise ConfigError(f"least_motion is {self.least_motion}; expected a share of coherence, 0 to less than 1.")
+        if self.most_tags is not None and self.most_tags < 1:
+            raise ConfigError(f"most_tags is {self.most_tags}; expected at least 1 tag, or null for all.")
 
     def arguments(self) -> dict[str, Any]:
         """What `load_clip` and `clip_dataset` both take, by name."""

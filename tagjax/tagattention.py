@@ -165,11 +165,11 @@ class TagAttention(AbstractSmoother):
     anchor_unseen: Float[Array, ""]
     log_foreground_weight: Float[Array, ""]
     log_rivalry: Float[Array, ""]
+    rest_doubt: Float[Array, ""]
+    log_rest_nats: Float[Array, ""]
 
     cell: int = eqx.field(static=True)
     max_speed_m_s: float = eqx.field(static=True)
-    rest_doubt: float = eqx.field(static=True)
-    rest_nats: float = eqx.field(static=True)
     box_tail: float = eqx.field(static=True)
     doubled_angle: bool = eqx.field(static=True)
     anchor_bins: int = eqx.field(static=True)
@@ -268,10 +268,10 @@ class TagAttention(AbstractSmoother):
             anchor_drift_m: error of the radio's distance that adds up, per frame.
             foreground_weight: pull of what stands before the background.
             rivalry: log odds that a pixel of another tag's object counts less, at most; infinite where a thing has one tag.
-            cell: cell of the segmentation grid, pixels of the working resolution.
-            max_speed_m_s: a faster change of a pixel's distance is another surface.
             rest_doubt, rest_nats: log odds that a claim loses while rest explains all of the tag's reads; against how much
                 evidence of the reads that it has moved, in nats, 1/e of that is left.
+            cell: cell of the segmentation grid, pixels of the working resolution.
+            max_speed_m_s: a faster change of a pixel's distance is another surface.
             box_tail: share of the mask that the box may leave out on each side.
             doubled_angle: take phases modulo pi in the coherent term (readers with pi flips).
             anchor_bins: number of ranges of 0.1 m that the anchor tells apart.
@@ -358,8 +358,8 @@ class TagAttention(AbstractSmoother):
         self.log_anchor_drift, self.log_anchor_rate = stored_log(anchor_drift_m), stored_log(anchor_rate)
         self.anchor_unseen = jnp.asarray(anchor_unseen, jnp.float32)
         self.log_foreground_weight, self.log_rivalry = stored_log(foreground_weight), stored_log(rivalry)
+        self.rest_doubt, self.log_rest_nats = jnp.asarray(rest_doubt, jnp.float32), stored_log(rest_nats)
         self.cell, self.max_speed_m_s = cell, max_speed_m_s
-        self.rest_doubt, self.rest_nats = rest_doubt, rest_nats
         self.box_tail, self.doubled_angle = box_tail, doubled_angle
         self.anchor_bins, self.cut_rule = anchor_bins, cut_rule
 
@@ -466,9 +466,10 @@ class TagAttention(AbstractSmoother):
         phases: PhaseMemory,
     ) -> tuple[Belief, Anchor, PhaseMemory]:
         """What one tag's radio says of every pixel by now; radio, reads, anchor, phases per antenna."""
-        evidence, gate = self._weighed_evidence(view, radio, reads)
+        gates = jax.vmap(self._gate, in_axes=(0, None))(radio, view.time_s)
+        evidence, gate = self._weighed_evidence(view, radio, reads, gates)
         anchor, nears = of_each_antenna(
-            functools.partial(self._update_anchor, view, evidence), view.ranging, anchor, radio
+            functools.partial(self._update_anchor, view, evidence), view.ranging, anchor, radio, gates
         )
         near = jnp.sum(nears, axis=0)
         evidence = evidence + jnp.exp(self.log_anchor_rate) * near
@@ -529,7 +530,7 @@ class TagAttention(AbstractSmoother):
         mask, centre = self._cut(view, shown, predicted, place)
         told = belief.log_odds + jax.nn.sigmoid(self.logit_range_share) * near
         sure = jnp.max(jnp.where((mask > 0.5) & valid, told, -9.0))
-        doubt = self.rest_doubt * jnp.exp(-moved / self.rest_nats)
+        doubt = self.rest_doubt * jnp.exp(-moved * jnp.exp(-self.log_rest_nats))
         confidence = jax.nn.sigmoid(sure - doubt)
         both = (place.confidence > 0.5) & (confidence > 0.5)
         move = jnp.clip((centre - place.centre_m) / view.elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
@@ -564,14 +565,13 @@ class TagAttention(AbstractSmoother):
         return gate * alpha / (alpha + uncertainty)
 
     def _weighed_evidence(
-        self, view: View, radio: RadioWindow, reads: PhaseReads
+        self, view: View, radio: RadioWindow, reads: PhaseReads, gates: Float[Array, " antenna"]
     ) -> tuple[Float[Array, "height width"], Float[Array, ""]]:
         """Evidence of all antennas, and the gate that it passes.
 
         What antennas measure is independent, so their evidence adds up, each behind its own gate; the common gate, which
         Eq. 7 forgets by, is the most open one, and the evidence is given relative to it.
         """
-        gates = jax.vmap(self._gate, in_axes=(0, None))(radio, view.time_s)
         each = of_each_antenna(functools.partial(self._evidence, view), view.ranging, radio, reads)
         gate = jnp.max(gates)
         return jnp.einsum("a,ahw->hw", gates / jnp.maximum(gate, 1e-6), each), gate
@@ -618,6 +618,7 @@ class TagAttention(AbstractSmoother):
         ranging: Ranging,
         anchor: Anchor,
         radio: RadioWindow,
+        gate: Float[Array, ""],
     ) -> tuple[Anchor, Float[Array, "height width"]]:
         """Move one antenna's anchor with its radio, let the segments that agree with the tag vote for its range.
 
@@ -635,7 +636,7 @@ class TagAttention(AbstractSmoother):
             jnp.exp(self.log_anchor_width),
             self.anchor_unseen,
         )
-        anchor = update_belief(anchor, vote, jnp.exp(self.log_anchor_weight) * self._gate(radio, view.time_s))
+        anchor = update_belief(anchor, vote, jnp.exp(self.log_anchor_weight) * gate)
         return anchor, self._near(view, ranging, anchor)
 
     def _near(self, view: View, ranging: Ranging, anchor: Anchor) -> Float[Array, "height width"]:

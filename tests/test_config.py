@@ -162,5 +162,6 @@ def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
         "length",
         "epcs",
         "least_motion",
+        "most_tags",
         "workers",
     }

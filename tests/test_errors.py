@@ -65,7 +65,7 @@ def _composed(name: str, *overrides: str) -> Iterator[None]:
         ("train", "joint=pyramids", "pyramid"),
         ("train", "debug=on", "default"),
         ("train_flow", "recipe=rafft", "raft"),
-        ("train_flow", "search=optun", "optuna"),
+        ("train", "search=optun", "optuna"),
     ],
 )
 def test_a_choice_that_hydra_drops_is_refused(name: str, override: str, known: str) -> None:

@@ -58,7 +58,7 @@ def test_settings_that_learned_parameters_replace_are_refused(tmp_path: Path) ->
     tracer = TagAttention(cell=4)
     with pytest.raises(ValueError, match=r"learned from beta=0.8.* but beta=0.5 is asked for"):
         load_parameters(tracer, path, {**SETTINGS, "beta": 0.5})
-    load_parameters(tracer, path, {**SETTINGS, "cell": 9, "rest_doubt": 0.2})  # which are not learned
+    load_parameters(tracer, path, {**SETTINGS, "cell": 9, "max_speed_m_s": 2.0})  # which are not learned
 
 
 def _changed(path: Path, **changes: Any) -> Path:

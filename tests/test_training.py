@@ -145,7 +145,7 @@ def test_confidence_is_best_as_the_share_of_pieces_that_are_won() -> None:
     one_lost = eqx.tree_at(lambda s: s.said.step_m, seen, seen.said.step_m.at[:, 1].set(-seen.said.step_m[:, 1]))
     sure = jnp.tile(jnp.array([0.8, 0.1]), (seen.said.confidence.shape[0], 1)).at[: SETTINGS.skip_frames + 1].set(0.5)
     told = eqx.tree_at(lambda s: s.said.confidence, one_lost, sure)
-    weight = np.asarray(eqx.filter_jit(agreement)(told, SETTINGS, KEY).weight).sum(axis=1)
+    weight = np.asarray(eqx.filter_jit(agreement)(told, SETTINGS, KEY).told_of_claim).sum(axis=1)
     expected = np.average([-np.log(0.8), -np.log(0.9)], weights=weight)
     assert float(judge(told)) == pytest.approx(expected, rel=1e-4)
     slope = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.said.confidence, told, p)))(sure)
@@ -153,6 +153,21 @@ def test_confidence_is_best_as_the_share_of_pieces_that_are_won() -> None:
     assert not np.asarray(slope)[: SETTINGS.skip_frames + 1].any()
     certain = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.said.confidence, told, p)))(jnp.zeros_like(sure))
     assert bool(jnp.isfinite(certain).all())
+
+
+def test_a_claim_that_moves_for_a_tag_that_rests_is_lost() -> None:
+    seen = _said_with_true_steps(_clip())
+    still = eqx.tree_at(lambda s: s.reads.phase_rad, seen, jnp.ones_like(seen.reads.phase_rad))
+    judge = eqx.filter_jit(calibration)
+    sure = eqx.tree_at(lambda s: s.said.confidence, still, jnp.full_like(still.said.confidence, 0.8))
+    loss, numbers = judge(sure, SETTINGS, KEY)
+    assert float(loss) == pytest.approx(-np.log1p(-0.8), rel=1e-4)
+    assert float(numbers["claims_won"]) == pytest.approx(0.0)
+    # On what rests as well nobody can tell, whatever is flipped.
+    flips = np.random.default_rng(0).uniform(size=still.reads.phase_rad.shape) < 0.1
+    flipped = eqx.tree_at(lambda s: s.reads.phase_rad, sure, still.reads.phase_rad + jnp.where(flips, jnp.pi, 0.0))
+    loss, _ = judge(eqx.tree_at(lambda s: s.said.step_m, flipped, jnp.zeros_like(seen.said.step_m)), SETTINGS, KEY)
+    assert float(loss) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_future_agreement_outlines_the_moving_object() -> None:

@@ -173,6 +173,7 @@ class Agreement(eqx.Module):
     still: Float[Array, "tag piece"]  # own reads with no motion at all
     own_coherence: Float[Array, "tag piece"]  # whatever the evidence: own reads with own motion, 0 to 1
     weight: Float[Array, "tag piece"]  # how much the piece can tell: 0 for a tag that rests or is not read
+    told_of_claim: Float[Array, "tag piece"]  # how much it can tell of a claim: 0 only if the own mask rests as well
 
     def own(self) -> Float[Array, "tag piece"]:
         """Own reads with the own mask's motion."""
@@ -188,7 +189,15 @@ class Agreement(eqx.Module):
 
     def mean(self, values: Float[Array, "tag piece"]) -> Float[Array, ""]:
         """Over the pieces, each as much as it can tell; 0 where none tells anything."""
-        return safe_divide(jnp.sum(values * self.weight), jnp.sum(self.weight))
+        return _weighed(values, self.weight)
+
+    def mean_of_claims(self, values: Float[Array, "tag piece"]) -> Float[Array, ""]:
+        """Over the pieces, each as much as it can tell of what is claimed."""
+        return _weighed(values, self.told_of_claim)
+
+
+def _weighed(values: Float[Array, "tag piece"], weight: Float[Array, "tag piece"]) -> Float[Array, ""]:
+    return safe_divide(jnp.sum(values * weight), jnp.sum(weight))
 
 
 def agreement(seen: Seen, settings: ObjectiveSettings, key: Array) -> Agreement:
@@ -239,14 +248,20 @@ def _agreement_of_antenna(
     rest = jnp.zeros(num_frames)
     # Reads of a resting tag are coherent with no motion at all, but for their noise, and flips, which two angles undo.
     modulo_pi = functools.partial(coherent, multiple=2)
-    lost = 1.0 - jax.vmap(modulo_pi, in_axes=(0, 0, None))(reads, inside, rest)
-    weight = jnp.where(jnp.any(inside, axis=-1), jax.nn.relu(lost - settings.rest_margin), 0.0)
+    by_rest = jax.vmap(modulo_pi, in_axes=(0, 0, None))(reads, inside, rest)
+    by_own = jax.vmap(modulo_pi)(reads, inside, steps)
+
+    def told_by(explained: Float[Array, "tag piece"]) -> Float[Array, "tag piece"]:
+        lost = jax.nn.relu(1.0 - explained - settings.rest_margin)
+        return jax.lax.stop_gradient(jnp.where(jnp.any(inside, axis=-1), lost, 0.0))
+
     return Agreement(
         between=jax.vmap(over_motions, in_axes=(0, 0, None))(reads, inside, steps),
         altered=jax.vmap(over_motions)(reads, inside, altered),
         still=jax.vmap(told, in_axes=(0, 0, None))(reads, inside, rest),
         own_coherence=jax.vmap(coherent)(reads, inside, steps),
-        weight=jax.lax.stop_gradient(weight),
+        weight=told_by(by_rest),
+        told_of_claim=told_by(jnp.minimum(by_rest, by_own)),
     )
 
 
@@ -272,7 +287,9 @@ def calibration(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Fl
     """Logarithmic score of the confidence in each piece as a forecast of whether the own mask's motion explains it best.
 
     A proper score (Good, 1952), least where of the pieces with confidence p a share p is won: contrast and coverage are blind to the
-    scale of the log odds, of which the cut takes what is near the best. What is won carries no gradient.
+    scale of the log odds, of which the cut takes what is near the best. Pieces weigh as much coherence, modulo pi, as
+    either rest or the own motion loses: a tag that rests while its mask moves is a claim that is lost. What is won carries
+    no gradient.
     """
     found = agreement(seen, settings, key)
     starts, span = _piece_frames(seen.frames.time_s.shape[0], settings)
@@ -281,7 +298,10 @@ def calibration(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Fl
     sure = jnp.clip(confidence, 1e-6, 1.0 - 1e-6)
     won = found.own() > jnp.max(found.candidates()[:, 1:], axis=1)
     score = -jnp.where(won, jnp.log(sure), jnp.log1p(-sure))
-    return found.mean(score), {"confidence": found.mean(confidence)}
+    return found.mean_of_claims(score), {
+        "confidence": found.mean_of_claims(confidence),
+        "claims_won": found.mean_of_claims(won.astype(score.dtype)),
+    }
 
 
 def coverage(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:

@@ -135,6 +135,7 @@ def _train(
             seed=config.seed,
             epcs=clips.epcs,
             least_motion=clips.least_motion,
+            most_tags=clips.most_tags,
             workers=clips.workers,
             share=(jax.process_index(), jax.process_count()),
             colour=config.joint is not None,
