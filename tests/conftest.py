@@ -23,16 +23,24 @@ if jax.__version_info__ < (0, 11):  # XLA ends a process that gives it a flag it
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
+    parser.addoption("--ci", action="store_true", help="also run the tests marked ci")
+    parser.addoption("--slow", action="store_true", help="also run the tests marked slow, and those marked ci")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--slow"):
-        return
-    skip = pytest.mark.skip(reason="slow: add --slow to run it")
+    slow = config.getoption("--slow")
+    asked = {"slow": slow, "ci": slow or config.getoption("--ci")}
     for item in items:
-        if "slow" in item.keywords:
-            item.add_marker(skip)
+        for name, is_asked in asked.items():
+            if item.get_closest_marker(name) and not is_asked:
+                item.add_marker(pytest.mark.skip(reason=f"{name}: add --{name} to run it"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forgotten():
+    """What a file's tests compiled, over a megabyte a program, goes with them: the more is kept, the slower the next."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="module")

@@ -223,18 +223,18 @@ def _moving_from(num_frames: int, begin: int) -> Recording:
 
 
 def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
-    late = _moving_from(80, 40)
-    starts = range(0, 71, 10)
+    late = _moving_from(50, 25)
+    starts = range(0, 41, 10)
     heard = motion_heard(late, starts, 10, ["tag-a", "tag-b"], [1])
-    assert heard.shape == (8, 2)
-    assert (heard[:3] < 1e-9).all()  # one that ends where they begin shares its last piece with what comes
-    assert (heard[4:] > 0.2).all()
+    assert heard.shape == (5, 2)
+    assert (heard[:1] < 1e-9).all()  # one that ends where they begin shares its last piece with what comes
+    assert (heard[3:] > 0.2).all()
     np.testing.assert_array_equal(motion_heard(late, starts, 10, ["tag-b"], [1]), heard[:, 1:])
     assert not motion_heard(late, starts, 10, ["tag-a"], [2]).any()  # never read there
     drawn = iter(clip_dataset([late], clip_length=10, step=10, seed=0, least_motion=0.1, stride=2))
-    assert {next(drawn).start for _ in range(8)} <= set(starts[3:])
+    assert {next(drawn).start for _ in range(5)} <= set(starts[1:])
     everything = iter(clip_dataset([late], clip_length=10, step=10, seed=0, stride=2))
-    assert {next(everything).start for _ in range(8)} == set(starts)
+    assert {next(everything).start for _ in range(5)} == set(starts)
     still = _moving_from(40, 39)
     with pytest.raises(
         RecordingError, match=r"In no clip of 10 frames is a tag heard to move by 0\.1 or more \(the most"
@@ -243,7 +243,7 @@ def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
 
 
 def test_of_many_tags_the_one_that_moves_most_is_kept_and_others_by_chance() -> None:
-    recording = synthetic.recording(80)
+    recording = synthetic.recording(40)
     reads = recording.reads
     first = reads.select("tag-a")
     still = [
@@ -252,12 +252,12 @@ def test_of_many_tags_the_one_that_moves_most_is_kept_and_others_by_chance() -> 
     ]
     both = dataclasses.replace(recording, reads=join_reads([reads, *still]))
     settings = {"clip_length": 10, "step": 10, "seed": 0, "stride": 2}
-    kept = [one.epcs for _, one in zip(range(8), clip_dataset([both], most_tags=3, **settings), strict=False)]
+    kept = [one.epcs for _, one in zip(range(4), clip_dataset([both], most_tags=3, **settings), strict=False)]
     assert {len(epcs) for epcs in kept} == {3}
     assert all({"tag-a", "tag-b"} & set(epcs) for epcs in kept)
     assert len(set(itertools.chain(*kept))) > 4
-    again = [one.epcs for _, one in zip(range(8), clip_dataset([both], most_tags=3, **settings), strict=False)]
-    assert again == kept
+    again = [one.epcs for _, one in zip(range(2), clip_dataset([both], most_tags=3, **settings), strict=False)]
+    assert again == kept[:2]
     assert len(next(iter(clip_dataset([both], **settings))).epcs) == 8
     assert len(next(iter(clip_dataset([both], most_tags=20, **settings))).epcs) == 8
     with pytest.raises(ValueError, match="most_tags is 0; expected at least 1 tag"):

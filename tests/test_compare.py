@@ -200,6 +200,7 @@ def test_what_cannot_be_compared_is_refused():
             _config(["occlusion"], **change)
 
 
+@pytest.mark.ci
 def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     config = _config(
         ["planar_tracks"], smoke=True, most=1, out=str(tmp_path / "made"), only=("tagattention_paper", "tagvision", "goller")

@@ -19,6 +19,8 @@ from tagjax.sim.record import Filmed, film
 from tagjax.sim.suites import Suite, stage_item
 from tagjax.sim.world import STEP_S, tag_path
 
+pytestmark = pytest.mark.ci
+
 C = 299_792_458.0
 FOLDER = Path(__file__).parents[1] / "conf" / "benchmark"
 STILL_S = 20.0

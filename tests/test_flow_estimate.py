@@ -262,6 +262,7 @@ def test_padding_hardly_changes_the_inside():
     assert np.abs(gap).max() > 0.01  # the edges do change
 
 
+@pytest.mark.ci
 def test_estimates_go_through_transformations():
     network = small_network(gain=30.0)
     first, second = (jnp.asarray(texture(70, 66, n), jnp.float32) / 255 for n in (1, 2))
@@ -613,19 +614,20 @@ def test_flow_files_name_every_setting(name):
 @pytest.mark.parametrize("name", ["pyramid", "pyramid_fast"])
 def test_packaged_weights_are_those_of_the_configured_network(name):
     with initialize_config_dir(str(CONF.parent), version_base="1.3"):
-        network = build(dict(compose("train_flow", [f"flow={name}"]).flow))
+        network = eqx.filter_eval_shape(build, dict(compose("train_flow", [f"flow={name}"]).flow))
     _same(load_weights(network), load_network(name))
 
 
 def test_the_packaged_fast_flow_sees_a_picture_move():
-    pictures = texture(96, 128), np.roll(texture(96, 128), (1, 3), axis=(0, 1))
+    pictures = texture(64, 96), np.roll(texture(64, 96), (1, 3), axis=(0, 1))
     error_px = np.linalg.norm(make_flow("pyramid_fast")(*pictures)[16:-16, 16:-16] - [3, 1], axis=-1)
     assert error_px.mean() < 0.5
 
 
 @pytest.mark.parametrize(
     "name",
-    ["zero", "dis_ultrafast", "pyramid_fast", "pyramid+rest"]
+    ["zero", "dis_ultrafast"]
+    + [pytest.param(name, marks=pytest.mark.ci) for name in ("pyramid_fast", "pyramid+rest")]
     + [pytest.param(name, marks=pytest.mark.slow) for name in ("pyramid", "pyramid_mid")],
 )
 def test_equal_pictures_have_no_flow_whatever_they_show(name: str) -> None:
@@ -642,6 +644,7 @@ def test_equal_pictures_have_no_flow_whatever_they_show(name: str) -> None:
         assert not any(way.any() for ways in flow_along(flow, [picture, picture.copy()]) for way in ways)
 
 
+@pytest.mark.ci
 def test_pictures_that_differ_keep_their_flow() -> None:
     """Equal but for one small thing that moves on a flat ground."""
     ground = np.full((96, 128, 3), 90, np.uint8)
@@ -664,6 +667,7 @@ def test_any_flow_by_name_comes_with_what_is_hidden(name: str) -> None:
     np.testing.assert_array_equal(found.forward_occluded, np.asarray(whole) <= 0.5)
 
 
+@pytest.mark.ci
 def test_networks_without_weights_and_variants_of_a_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"'raft_small' comes without weights.*flow=raft_small"):
         make_flow("raft_small")

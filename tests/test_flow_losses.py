@@ -454,6 +454,7 @@ def test_the_terms_are_summed_over_levels_by_their_weights():
     assert float(total) == pytest.approx(sum(map(float, parts)), rel=1e-6)
 
 
+@pytest.mark.ci
 def test_jit_agrees_with_eager_and_vmap_with_a_loop():
     ways = [(_pyramid(seed), _pyramid(seed + 9)) for seed in (0, 1)]
     first, second = _colour(seed=0), _colour(seed=5)

@@ -424,6 +424,7 @@ def test_a_student_is_given_its_teachers_flow_of_drawn_pairs_and_of_cuts(tmp_pat
     assert len(list(Path(settings.drawn.folder).glob("flow-of-*"))) == 2
 
 
+@pytest.mark.ci
 def test_a_student_learns_what_the_teacher_says() -> None:
     samples = batch(2)
     for sample in samples:
@@ -529,6 +530,7 @@ def batch(count: int = 2, seed: int = 0) -> list[dict[str, np.ndarray]]:
     return [{"clean": pair, "seen": pair} for pair in pictures]
 
 
+@pytest.mark.ci
 def test_step_learns_counts_and_skips_what_is_not_finite() -> None:
     settings = FlowLossSettings(census_radius=1, census_stride=1)
     optimizer = optax.adam(1e-3)

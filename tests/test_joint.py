@@ -71,6 +71,7 @@ def test_what_has_moved_is_what_the_cache_keeps():
     assert np.mean(kept == np.asarray(found)) > 0.995
 
 
+@pytest.mark.ci
 def test_flow_inside_the_objective_is_the_cached_flow(tmp_path: Path, clip):
     network = _panning_network()
     weights = tmp_path / "flow.npz"

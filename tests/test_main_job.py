@@ -46,7 +46,7 @@ def _values(recordings: list[str]) -> dict:
         # Softened, the paper's tracer has parameters to learn, too; with it the test takes half as long.
         "tracer": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},
-        "baselines": {"learnable": {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}},
+        "baselines": {"paper": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4}},
         "data": {
             "recordings": recordings[:1],
             "validation": recordings[1:],
@@ -64,7 +64,7 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
     score = run_training(from_mapping(TrainConfig, values), tmp_path)
     assert 0.0 <= score <= 1.0
     summary = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(summary) == {"learned", "untrained", "learnable"}
+    assert set(summary) == {"learned", "untrained", "paper"}
     assert summary["learned"]["all"]["iou"] == pytest.approx(score)
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 2]
@@ -77,7 +77,7 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
     again = run_evaluation(
         from_mapping(EvaluateConfig, {"run": str(tmp_path), "progress": False}), tmp_path / "again", run_values=gone
     )
-    assert set(again) == {"learned", "learnable"}
+    assert set(again) == {"learned", "paper"}
     assert again["learned"]["all"] == pytest.approx(summary["learned"]["all"])
     part = from_mapping(
         EvaluateConfig,
@@ -111,7 +111,7 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
     assert math.isnan(run_training(from_mapping(TrainConfig, values), tmp_path))
     kept = make_tracer(values["tracer"], str(tmp_path / "weights.json"))
     assert run_module.parameters(kept) == pytest.approx(run_module.parameters(learned), rel=1e-6)
-    assert set(json.loads((tmp_path / "parameters.json").read_text())) == {"learned", "untrained", "learnable"}
+    assert set(json.loads((tmp_path / "parameters.json").read_text())) == {"learned", "untrained", "paper"}
 
 
 def test_what_a_run_says_of_itself_is_not_given_again() -> None:

@@ -203,7 +203,7 @@ def test_phase_likelihood_of_nothing_and_its_gradient(gradients_agree):
     channel = jnp.asarray(rng.integers(0, 3, 12))
 
     def value(residual, concentration):
-        settled = {"num_channels": 3, "flip_share": 0.05, "num_iterations": 60}
+        settled = {"num_channels": 3, "flip_share": 0.05, "num_iterations": 20}
         return phase_likelihood(residual, concentration, channel, **settled)
 
     gradients_agree(jax.jit(value), (rng.normal(0.5, 0.5, 12), rng.uniform(1, 8, 12)))

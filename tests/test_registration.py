@@ -101,6 +101,7 @@ def estimated():
     return told, (colour, depth), held_out, estimate_correction(colour, depth, told)
 
 
+@pytest.mark.ci
 def test_a_known_residual_is_recovered_to_a_pixel_in_held_out_frames(estimated) -> None:
     told, _, (_, depths), found = estimated
     errors = {"before": [], "after": []}
@@ -114,6 +115,7 @@ def test_a_known_residual_is_recovered_to_a_pixel_in_held_out_frames(estimated) 
     assert np.percentile(after, 95) < 1.0
 
 
+@pytest.mark.ci
 def test_the_misalignment_told_is_the_one_there_is(estimated) -> None:
     told, _, (colour, depth), found = estimated
     right = told.corrected(RESIDUAL)
@@ -129,6 +131,7 @@ def test_the_misalignment_told_is_the_one_there_is(estimated) -> None:
     assert found.line().startswith(f"Residual registration: {found.before.median_px:.1f} px before, ")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("shift_px", [(0.0, 0.0), pytest.param((14.0, -17.0), marks=pytest.mark.slow)])
 def test_right_is_left_where_it_is_and_far_off_is_brought_back(estimated, shift_px) -> None:
     told, (colour, depth), _, _ = estimated
@@ -139,6 +142,7 @@ def test_right_is_left_where_it_is_and_far_off_is_brought_back(estimated, shift_
     assert np.percentile(error, 95) < 1.2
 
 
+@pytest.mark.ci
 def test_an_estimate_is_the_same_every_time(estimated) -> None:
     told, (colour, depth), _, found = estimated
     assert estimate_correction(colour, depth, told).correction == found.correction
@@ -177,6 +181,7 @@ def folder(estimated, tmp_path):
     return tmp_path
 
 
+@pytest.mark.ci
 @pytest.mark.filterwarnings("ignore:The recording holds no tag read")
 def test_an_import_estimates_and_tells_so_that_it_can_be_repeated(folder, estimated) -> None:
     told, (_, depth), _, _ = estimated

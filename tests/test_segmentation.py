@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 from scipy.cluster.vq import kmeans2
 
-from tagjax.segmentation import (
-    bounding_box,
-    cdf_corner,
-    diffuse,
-    mean_shift,
-    min_max,
-    pool,
-    segment,
-    segment_affinity,
-    unpool,
+from tagjax import segmentation
+
+# Compiled as a whole: as single operations most of the time would go into compiling each.
+segment = jax.jit(segmentation.segment, static_argnames=("cell", "num_iterations"))
+mean_shift = jax.jit(segmentation.mean_shift, static_argnames="num_iterations")
+bounding_box = jax.jit(segmentation.bounding_box, static_argnames="tail")
+cdf_corner, diffuse, min_max, pool, segment_affinity, unpool = map(
+    jax.jit,
+    (
+        segmentation.cdf_corner,
+        segmentation.diffuse,
+        segmentation.min_max,
+        segmentation.pool,
+        segmentation.segment_affinity,
+        segmentation.unpool,
+    ),
 )
 
 

@@ -131,6 +131,7 @@ def test_the_radio_backwards_tells_the_distances_backwards(recording: Recording)
         )
 
 
+@pytest.mark.ci
 def test_past_and_future_add_up_to_all_there_is(recording: Recording) -> None:
     """Where nothing fades or is bounded and motion is seen pair by pair, their sum is the same at every frame."""
     tracer = _tracer(

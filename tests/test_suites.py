@@ -307,6 +307,7 @@ def test_things_do_not_pass_through_each_other(name, variant):
             assert np.maximum(across, above).min() > 0, (item.name, one.name, other.name)
 
 
+@pytest.mark.ci
 def test_people_walk_as_fast_as_the_suite_says():
     """All items: the asked speed is reached on the legs and kept there; what is traced is the person, with a badge."""
     for item in (suite := _named("speed")).items():

@@ -72,6 +72,7 @@ def test_step_follows_the_objects_distance(clip, said):
         np.testing.assert_allclose(np.asarray(out.step_m[-8:, tag, 0]), expected, atol=0.02)
 
 
+@pytest.mark.ci
 def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip):
     """Without rivalry any number of tags and antennas are as one: each tag is traced by what was heard of it alone."""
     tracer = _learnable(rivalry=1e-12)
@@ -94,6 +95,7 @@ def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip):
     np.testing.assert_allclose(said.step_m[:, 1, 0], single.step_m[:, 0, 0], atol=1e-4)
 
 
+@pytest.mark.ci
 def test_two_tags_of_one_thing_both_find_it(clip):
     """Rivalry tells tags of different things apart; it keeps none from a thing that it shares."""
     frames = eqx.tree_at(
@@ -109,6 +111,7 @@ def test_two_tags_of_one_thing_both_find_it(clip):
         assert bool(out.found[-1, tag])
 
 
+@pytest.mark.ci
 def test_the_reads_tell_that_a_tag_has_moved(clip):
     """Evidence against rest grows for a tag that moves, not for one whose phases never change, and raises doubt of it."""
     reads = clip.frames.reads
@@ -170,6 +173,7 @@ def _side_by_side() -> tuple[Camera, Frame, np.ndarray]:
     )
 
 
+@pytest.mark.ci
 def test_a_second_antenna_splits_what_one_cannot():
     camera, frames, boxes = _side_by_side()
     mask = np.asarray(eqx.filter_jit(trace)(_learnable(), camera, frames).mask[-1]) > 0.5
@@ -222,7 +226,7 @@ def _degenerate(frames: Frame):
 @pytest.mark.parametrize(
     "tracer",
     [
-        pytest.param(_learnable(rest_doubt=0.3), id="learnable"),
+        pytest.param(_learnable(rest_doubt=0.3), id="learnable", marks=pytest.mark.ci),
         pytest.param(TagAttentionPaper(cell=4), id="paper", marks=pytest.mark.slow),
     ],
 )

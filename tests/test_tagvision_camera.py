@@ -230,6 +230,7 @@ def test_a_folder_of_pictures_is_calibrated(tmp_path: Path) -> None:
         load_camera(tmp_path / "camera.json")
 
 
+@pytest.mark.ci
 def test_the_command_reports_or_says_what_is_wrong(tmp_path: Path) -> None:
     rng, run = np.random.default_rng(12), [sys.executable, "-m", "experiments.calibrate_camera"]
     for seed in range(4):

@@ -370,6 +370,7 @@ def test_speeds_that_are_none_are_named(tmp_path, line, message):
         load_tagged(tmp_path, RATE_HZ)
 
 
+@pytest.mark.ci
 @pytest.mark.real_data
 def test_real_tags_are_carried_by_who_walks_as_they_do(real_data):
     """Three recordings of other days agree on where the antenna stood, and each tag's carrier suits it best by far."""

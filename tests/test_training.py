@@ -101,6 +101,7 @@ def test_true_motion_explains_own_reads_and_no_others() -> None:
     assert float(numbers["own_wins"]) == pytest.approx(1.0)
 
 
+@pytest.mark.ci
 def test_likelihood_tells_tags_apart_whatever_is_flipped() -> None:
     settings = dataclasses.replace(SETTINGS, evidence="likelihood", temperature=2.0)
     seen = _said_with_true_steps(_clip())
@@ -184,7 +185,7 @@ def test_future_agreement_outlines_the_moving_object() -> None:
 
 
 def _masked(clip: synthetic.SyntheticClip, mask: np.ndarray):
-    seen = see(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
+    seen = eqx.filter_jit(see)(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
     height, width = clip.frames.depth_m.shape[1:]
     whole = np.broadcast_to(mask, (clip.frames.depth_m.shape[0], seen.said.mask.shape[1], height, width))
     return eqx.tree_at(lambda s: s.said.mask, seen, jnp.asarray(whole, jnp.float32))
@@ -196,17 +197,18 @@ def test_priors_have_their_closed_forms() -> None:
     two = np.zeros((height, width))
     two[3, 4] = two[9, 4] = 1.0
     seen = _masked(clip, two)
-    assert float(area(seen, SETTINGS, KEY)[0]) == pytest.approx(2 / (height * width))
+    small, compact, steady = (eqx.filter_jit(one) for one in (area, compactness, steadiness))
+    assert float(small(seen, SETTINGS, KEY)[0]) == pytest.approx(2 / (height * width))
     points = np.asarray(clip.camera.rays)[None] * np.asarray(clip.frames.depth_m)[..., None]
     apart = np.sum((points[:, 3, 4] - points[:, 9, 4]) ** 2, axis=-1)  # each lies half of it from the middle
     started = min(SETTINGS.skip_frames, len(apart) - 1)
-    assert float(compactness(seen, SETTINGS, KEY)[0]) == pytest.approx(np.mean(apart[started:]) / 4, rel=1e-4)
+    assert float(compact(seen, SETTINGS, KEY)[0]) == pytest.approx(np.mean(apart[started:]) / 4, rel=1e-4)
     # A mask that goes along with the flow is steady; the same one that stays while the picture moves is not.
     shift = jnp.broadcast_to(jnp.array([-1.0, 0.0]), clip.frames.backward_px.shape)
     moving = np.stack([np.roll(two, t, axis=1) for t in range(8)])[:, None]
     for mask, expected in ((moving, 0.0), (two, 1.0 - 1.0 / 5.0)):
         along = eqx.tree_at(lambda s: s.frames.backward_px, _masked(clip, mask), shift)
-        assert float(steadiness(along, SETTINGS, KEY)[0]) == pytest.approx(expected, abs=1e-5)
+        assert float(steady(along, SETTINGS, KEY)[0]) == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("name", ["area", "compactness", "steadiness"])
@@ -223,7 +225,7 @@ def test_priors_have_the_gradient_of_their_masks(gradients_agree, name: str) -> 
         return TERMS[name](scaled, settings, KEY)[0]
 
     gradients_agree(jax.jit(loss), (np.array([0.3]),), atol=1e-6)
-    empty = jax.grad(lambda m: TERMS[name](eqx.tree_at(lambda s: s.said.mask, seen, m), settings, KEY)[0])
+    empty = jax.jit(jax.grad(lambda m: TERMS[name](eqx.tree_at(lambda s: s.said.mask, seen, m), settings, KEY)[0]))
     assert bool(jnp.isfinite(empty(jnp.zeros_like(seen.said.mask))).all())
 
 
