@@ -188,6 +188,7 @@ def test_the_true_distances_may_stand_in_for_the_radio(recording: Recording) -> 
         load_clip(elsewhere, 3, 12, **SMALL, estimator="truth")
 
 
+@pytest.mark.ci
 def test_clips_that_threads_load_at_once_are_those_of_one_after_the_other():
     recording = synthetic.recording(12)
     load = lambda start: load_clip(recording, start, start + 6, stride=2)  # noqa: E731
@@ -242,6 +243,7 @@ def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
         clip_dataset([still], clip_length=10, seed=0, least_motion=0.1, stride=2)
 
 
+@pytest.mark.ci
 def test_of_many_tags_the_one_that_moves_most_is_kept_and_others_by_chance() -> None:
     recording = synthetic.recording(40)
     reads = recording.reads

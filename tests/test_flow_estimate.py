@@ -689,6 +689,7 @@ def test_the_package_gives_flows_by_name() -> None:
         tagjax.flow.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
 
 
+@pytest.mark.ci
 def test_readmes_flow_of_two_pictures_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (Path(__file__).parents[1] / "README.md").read_text().split("## Optical flow")[1]
     code = text.split("```python\n")[1].split("```")[0]

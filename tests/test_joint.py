@@ -141,7 +141,7 @@ def test_the_loss_moves_as_its_gradient_says(clip):
 
 
 def test_a_clip_without_pictures_is_refused():
-    bare = load_clip(_panned(), 0, 6, stride=4, flow="zero")
+    bare = load_clip(synthetic.recording(4), 0, 4, stride=2, flow="zero")
     with pytest.raises(ValueError, match="colour=True"):
         network_flow(small_network(), bare.frames, LOSS)
 

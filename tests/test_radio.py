@@ -362,6 +362,7 @@ def sensitivity():
     return take
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("instant", [None, 0.5, 0.53])  # None: spread over time; 0.5 is a frame's own time
 @pytest.mark.parametrize("number", [0, 1, 2, 32])
 def test_gradients_are_finite_however_few_the_reads(sensitivity, number, instant):

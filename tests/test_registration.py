@@ -164,21 +164,26 @@ def test_frames_must_be_pairs_and_several() -> None:
         estimate_correction(colour[:4], depth[:4], _told())
 
 
+def _written(path, view, colour, depth):
+    """A folder of pictures with their depth and calibration."""
+    for number, (picture, raw) in enumerate(zip(colour, depth, strict=True)):
+        cv2.imwrite(str(path / f"{number:04d}.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 97])
+        scipy.io.savemat(path / f"{number:04d}.mat", {"depth_array": raw})
+    camera = {
+        "Kdepth": view.depth_camera.matrix(),
+        "Krgb": view.colour_camera.matrix(),
+        "R": view.rotation,
+        "T": view.translation_m,
+    }
+    (path / "camera").mkdir()
+    scipy.io.savemat(path / "camera" / "camera.mat", {"cam_params": camera})
+    return path
+
+
 @pytest.fixture
 def folder(estimated, tmp_path):
     told, (colour, depth), _, _ = estimated
-    for number, (picture, raw) in enumerate(zip(colour, depth, strict=True)):
-        cv2.imwrite(str(tmp_path / f"{number:04d}.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 97])
-        scipy.io.savemat(tmp_path / f"{number:04d}.mat", {"depth_array": raw})
-    camera = {
-        "Kdepth": told.depth_camera.matrix(),
-        "Krgb": told.colour_camera.matrix(),
-        "R": told.rotation,
-        "T": told.translation_m,
-    }
-    (tmp_path / "camera").mkdir()
-    scipy.io.savemat(tmp_path / "camera" / "camera.mat", {"cam_params": camera})
-    return tmp_path
+    return _written(tmp_path, told, colour, depth)
 
 
 @pytest.mark.ci
@@ -203,7 +208,8 @@ def test_an_import_estimates_and_tells_so_that_it_can_be_repeated(folder, estima
 
 
 @pytest.mark.parametrize("wrong", ["guess", (0.0, 1.0), (0.0, 0.0, 0.0, 1.0, 1.0, float("nan"), 0.0), ["a"] * 7, 3.0])
-def test_a_correction_that_is_none_is_refused(folder, wrong) -> None:
+def test_a_correction_that_is_none_is_refused(tmp_path, wrong) -> None:
+    folder = _written(tmp_path, _told(), np.zeros((2, 24, 32, 3), np.uint8), np.zeros((2, 24, 32), np.uint16))
     with pytest.raises(RecordingError, match="expected null, estimate or 7 numbers"):
         import_recording(
             ImportSettings(video=str(folder), calibration=str(folder / "camera" / "camera.mat"), correction=wrong)

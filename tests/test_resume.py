@@ -172,6 +172,7 @@ def test_a_scheduler_s_sigterm_leaves_workers_time_for_the_last_step() -> None:
         worker.join()
 
 
+@pytest.mark.ci
 def test_shares_of_a_stream_are_the_stream_and_places_are_common() -> None:
     whole, parts = _clips(), [_clips(share=(number, 2)) for number in range(2)]
     starts = [next(whole).start for _ in range(8)]

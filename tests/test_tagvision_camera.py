@@ -181,6 +181,7 @@ def test_corners_of_a_drawn_board_are_found_to_a_tenth_of_a_pixel() -> None:
     assert find_corners(np.full((240, 320), 128, np.uint8), board) is None
 
 
+@pytest.mark.ci
 def test_a_folder_of_pictures_is_calibrated(tmp_path: Path) -> None:
     rng, board = np.random.default_rng(11), Board()
     folder = tmp_path / "pictures"
