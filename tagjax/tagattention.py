@@ -166,8 +166,8 @@ class TagAttention(AbstractSmoother):
     log_foreground_weight: Float[Array, ""]
     log_rivalry: Float[Array, ""]
     rest_doubt: Float[Array, ""]
-    log_rest_nats: Float[Array, ""]
 
+    rest_nats: float = eqx.field(static=True)
     cell: int = eqx.field(static=True)
     max_speed_m_s: float = eqx.field(static=True)
     box_tail: float = eqx.field(static=True)
@@ -225,7 +225,7 @@ class TagAttention(AbstractSmoother):
         cell: int = 6,
         max_speed_m_s: float = 3.0,
         rest_doubt: float = 0.0,
-        rest_nats: float = 4.0,
+        rest_nats: float = 2.0,
         box_tail: float = 0.02,
         doubled_angle: bool = True,
         anchor_bins: int = 120,
@@ -269,7 +269,7 @@ class TagAttention(AbstractSmoother):
             foreground_weight: pull of what stands before the background.
             rivalry: log odds that a pixel of another tag's object counts less, at most; infinite where a thing has one tag.
             rest_doubt, rest_nats: log odds that a claim loses while rest explains all of the tag's reads; against how much
-                evidence of the reads that it has moved, in nats, 1/e of that is left.
+                evidence of the reads that it has moved, in nats, 1/e of that is left (not learned: chance sets it).
             cell: cell of the segmentation grid, pixels of the working resolution.
             max_speed_m_s: a faster change of a pixel's distance is another surface.
             box_tail: share of the mask that the box may leave out on each side.
@@ -358,7 +358,7 @@ class TagAttention(AbstractSmoother):
         self.log_anchor_drift, self.log_anchor_rate = stored_log(anchor_drift_m), stored_log(anchor_rate)
         self.anchor_unseen = jnp.asarray(anchor_unseen, jnp.float32)
         self.log_foreground_weight, self.log_rivalry = stored_log(foreground_weight), stored_log(rivalry)
-        self.rest_doubt, self.log_rest_nats = jnp.asarray(rest_doubt, jnp.float32), stored_log(rest_nats)
+        self.rest_doubt, self.rest_nats = jnp.asarray(rest_doubt, jnp.float32), rest_nats
         self.cell, self.max_speed_m_s = cell, max_speed_m_s
         self.box_tail, self.doubled_angle = box_tail, doubled_angle
         self.anchor_bins, self.cut_rule = anchor_bins, cut_rule
@@ -399,10 +399,10 @@ class TagAttention(AbstractSmoother):
             belief = jax.vmap(self._with_hindsight, in_axes=(None, 0, 0, 0))(view, belief, state.anchor, frame.later)
             moved = jnp.maximum(moved, frame.later.moved)
         rivals = soft_clip(rival_log_odds(belief.held + belief.near), jnp.exp(self.log_rivalry))
-        mask, place = jax.vmap(self._locate, in_axes=(None, 0, 0, 0, 0))(
-            view, belief, rivals, jnp.max(moved, axis=1), state.place
-        )
-        out = describe(mask, place.centre_m, seen.step_m, seen.recent, place.confidence, self.box_tail)
+        mask, place, sure = jax.vmap(self._locate, in_axes=(None, 0, 0, 0))(view, belief, rivals, state.place)
+        # Whether there is anything to claim is doubted, not where it is: the place is kept as it is.
+        confidence = jax.nn.sigmoid(sure - self._doubt(jnp.max(moved, axis=1)))
+        out = describe(mask, place.centre_m, seen.step_m, seen.recent, confidence, self.box_tail)
         # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
         return eqx.tree_at(lambda one: one.place, state, jax.lax.stop_gradient(place)), out
 
@@ -513,10 +513,9 @@ class TagAttention(AbstractSmoother):
         view: View,
         belief: Belief,
         rivals: Float[Array, "height width"],
-        moved: Float[Array, ""],
         place: Place,
-    ) -> tuple[Float[Array, "height width"], Place]:
-        """One tag's soft mask and place, by what is believed of it and of the other tags."""
+    ) -> tuple[Float[Array, "height width"], Place, Float[Array, ""]]:
+        """One tag's soft mask, place, and log odds of the claim, by what is believed of it and of the other tags."""
         valid, held, near = view.valid, belief.held, belief.near
         # Where nothing else can be its object, a tag shares one with its rivals. A maximum has the gradient 0 / 0 where it
         # is computed once more and rounded otherwise, as in the backward pass; and far from even odds it has none.
@@ -530,8 +529,7 @@ class TagAttention(AbstractSmoother):
         mask, centre = self._cut(view, shown, predicted, place)
         told = belief.log_odds + jax.nn.sigmoid(self.logit_range_share) * near
         sure = jnp.max(jnp.where((mask > 0.5) & valid, told, -9.0))
-        doubt = self.rest_doubt * jnp.exp(-moved * jnp.exp(-self.log_rest_nats))
-        confidence = jax.nn.sigmoid(sure - doubt)
+        confidence = jax.nn.sigmoid(sure)
         both = (place.confidence > 0.5) & (confidence > 0.5)
         move = jnp.clip((centre - place.centre_m) / view.elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)
         velocity = jnp.where(both, 0.5 * place.velocity_m_s + 0.5 * move, 0.0)
@@ -539,7 +537,11 @@ class TagAttention(AbstractSmoother):
         radius = safe_sqrt(jnp.sum(mask * away) / jnp.maximum(jnp.sum(mask), 1e-6))
         rate = jax.nn.sigmoid(self.logit_size_rate)
         size_m = jnp.where(confidence > 0.5, (1.0 - rate) * place.radius_m + rate * radius, place.radius_m)
-        return mask, Place(centre, velocity, confidence, size_m)
+        return mask, Place(centre, velocity, confidence, size_m), sure
+
+    def _doubt(self, moved: Float[Array, "*tag"]) -> Float[Array, "*tag"]:
+        """Log odds that a claim loses, by the evidence of the tag's reads that it has moved at all, in nats."""
+        return self.rest_doubt * jnp.exp(-moved / self.rest_nats)
 
     def _phase_evidence(
         self, view: View, ranging: Ranging, reads: PhaseReads, phases: PhaseMemory

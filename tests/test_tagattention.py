@@ -134,7 +134,7 @@ def test_the_reads_tell_that_a_tag_has_moved(clip):
     # The radio's path still says that both move, as it might by mistake: doubt takes five from the log odds of the one that
     # rests.
     gap = jax.scipy.special.logit(believed.confidence[-1]) - jax.scipy.special.logit(doubted.confidence[-1])
-    np.testing.assert_allclose(gap, [0.0, 5.0 * np.exp(-moved[1] / 4.0)], atol=0.3)
+    np.testing.assert_allclose(gap, [0.0, 5.0 * np.exp(-moved[1] / 2.0)], atol=0.3)
 
 
 def _side_by_side() -> tuple[Camera, Frame, np.ndarray]:
