@@ -269,10 +269,10 @@ def compact_cut(
 
 
 def bounding_box(mask: Float[Array, "height width"], tail: float) -> Float[Array, " 4"]:
-    """Box x0 y0 x1 y1 (pixel edges) that leaves at most the share `tail` of the mask outside on each side.
+    """Box x0 y0 x1 y1 (first and last pixel, both inside) that leaves at most the share `tail` of the mask outside on each side.
 
-    tail = 0 is the exact bounding box of a binary mask; a small tail keeps a stray pixel from stretching it. An empty
-    mask gives an empty box at the origin.
+    tail = 0 is the exact bounding box of a binary mask; a small tail keeps a stray pixel from stretching it, and takes
+    off what is thin at an end. An empty mask gives zeros.
     """
 
     def span(profile: Float[Array, " size"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -280,10 +280,10 @@ def bounding_box(mask: Float[Array, "height width"], tail: float) -> Float[Array
         below = jnp.cumsum(profile)
         above = jnp.flip(jnp.cumsum(jnp.flip(profile)))
         first = jnp.sum(below <= tail * total + 1e-6 * total)
-        last = profile.shape[0] - jnp.sum(above <= tail * total + 1e-6 * total)
+        last = profile.shape[0] - 1 - jnp.sum(above <= tail * total + 1e-6 * total)
         some = total > 0
         return jnp.where(some, first, 0).astype(mask.dtype), jnp.where(some, last, 0).astype(mask.dtype)
 
     x0, x1 = span(jnp.sum(mask, axis=0))
     y0, y1 = span(jnp.sum(mask, axis=1))
-    return jnp.stack([x0, y0, x1, y1]) - 0.5 * (x1 > x0).astype(mask.dtype)
+    return jnp.stack([x0, y0, x1, y1])

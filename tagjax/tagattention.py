@@ -226,7 +226,7 @@ class TagAttention(AbstractSmoother):
         max_speed_m_s: float = 3.0,
         rest_doubt: float = 0.0,
         rest_nats: float = 2.0,
-        box_tail: float = 0.02,
+        box_tail: float = 0.0,
         doubled_angle: bool = True,
         anchor_bins: int = 120,
         cut_rule: Literal["margin", "cdf_corner"] = "margin",

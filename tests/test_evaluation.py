@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import itertools
 import json
 from pathlib import Path
 
@@ -25,9 +26,11 @@ from tagjax.evaluation.evaluate import (
     score_traces,
     trace_recording,
 )
+from tagjax.evaluation.metrics import box_iou, label_box
 from tagjax.evaluation.report import plain, score_table, summarise, write_report
 from tagjax.recording import RecordingError
-from tagjax.tracer import Trace, trace
+from tagjax.tagattention import TagAttention
+from tagjax.tracer import Trace, describe, trace
 from tagjax.viz.overlay import MIN_WIDTH, _extent, _free_place
 
 EPCS = list(synthetic.EPCS)
@@ -152,6 +155,37 @@ def test_working_pixels_land_on_their_own_place_in_the_picture() -> None:
     assert abs(columns.min() - box[0]) <= 1
     assert abs(rows.max() - box[3]) <= 1
     np.testing.assert_array_equal(box_to_picture(np.array([0.0, 0.0, 7.0, 5.0]), 4, 24, 32), [0, 0, 29.5, 21.5])
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_the_box_of_a_right_mask_is_the_true_box(stride: int) -> None:
+    """From a tracer's mask to its score: no side is too long or too short, wherever the thing lies on the grid."""
+    sides, overlaps = [], []
+    for shift in itertools.product(range(stride), repeat=2):
+        labels = np.zeros((96, 128), np.int32)
+        labels[20 + shift[0] : 60 + shift[0], 40 + shift[1] : 70 + shift[1]] = 1
+        box, true_box = _box_of_the_true_mask(labels, stride), label_box(labels, 1)
+        sides.append((box[2:] - box[:2]) - (true_box[2:] - true_box[:2]))
+        overlaps.append(box_iou(box, true_box))
+    np.testing.assert_allclose(np.mean(sides, axis=0), 0.0, atol=1e-9)
+    off = 0.5 * (stride - 1)  # what a grid of this step may be off by, at most
+    shared = (40 - off) * (30 - off)
+    assert min(overlaps) >= shared / (2 * 40 * 30 - shared) - 1e-9
+
+
+def test_what_is_thin_at_its_ends_is_boxed_whole() -> None:
+    labels = np.zeros((96, 128), np.uint8)
+    cv2.ellipse(labels, (60, 50), (16, 40), 0, 0, 360, 1, -1)
+    np.testing.assert_array_equal(
+        _box_of_the_true_mask(labels.astype(np.int32), 1), label_box(labels.astype(np.int32), 1)
+    )
+
+
+def _box_of_the_true_mask(labels: np.ndarray, stride: int) -> np.ndarray:
+    mask = jnp.asarray(labels[::stride, ::stride] == 1, jnp.float32)[None]
+    none = jnp.zeros((1, *mask.shape[1:]))
+    said = describe(mask, jnp.zeros((1, 3)), none, none[0] > 0, jnp.ones(1), TagAttention().box_tail)
+    return box_to_picture(np.asarray(said.box_px[0]), stride, *labels.shape)
 
 
 def test_report_is_complete(tmp_path: Path) -> None:

@@ -178,8 +178,9 @@ def test_mean_shift_finds_the_near_mode():
 
 def test_box_of_a_binary_mask_is_exact_and_a_tail_drops_strays():
     mask = jnp.zeros((20, 30)).at[5:11, 7:19].set(1.0)
-    np.testing.assert_allclose(bounding_box(mask, 0.0), [6.5, 4.5, 18.5, 10.5])
+    np.testing.assert_array_equal(bounding_box(mask, 0.0), [7, 5, 18, 10])
     stray = mask.at[19, 29].set(1.0)
-    np.testing.assert_allclose(bounding_box(stray, 0.0), [6.5, 4.5, 29.5, 19.5])
-    np.testing.assert_allclose(bounding_box(stray, 0.02), [6.5, 4.5, 18.5, 10.5])
+    np.testing.assert_array_equal(bounding_box(stray, 0.0), [7, 5, 29, 19])
+    np.testing.assert_array_equal(bounding_box(stray, 0.02), [7, 5, 18, 10])
+    np.testing.assert_array_equal(bounding_box(mask.at[:].set(1.0), 0.0), [0, 0, 29, 19])
     np.testing.assert_array_equal(bounding_box(jnp.zeros((4, 4)), 0.02), jnp.zeros(4))
