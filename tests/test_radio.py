@@ -104,6 +104,16 @@ def test_paper_unwrapping_keeps_the_velocity_over_an_impossible_step():
     np.testing.assert_allclose(np.diff(out), 0.3 * 0.02, rtol=2e-2)
 
 
+def test_a_step_that_was_refused_does_not_come_back_after_a_hop():
+    time_s = np.arange(12) * 0.02
+    phase = 4 * np.pi * 920e6 / C * 0.3 * time_s
+    phase[6] += 1.2  # refused, and the next read is of another channel
+    out = np.asarray(unwrap_paper(_buffer(time_s, phase, channel=(np.arange(12) > 6).astype(int))))
+    expected = np.full(11, 0.3 * 0.02)
+    expected[6] = 0.0  # held at the hop
+    np.testing.assert_allclose(np.diff(out), expected, atol=2e-4)
+
+
 def test_paper_unwrapping_holds_at_a_channel_change():
     reads = _buffer([0.0, 0.02, 0.04], [0.1, 0.2, 1.5], channel=np.array([0, 0, 1]))
     out = np.asarray(unwrap_paper(reads))
@@ -122,6 +132,17 @@ def test_polynomial_resampling_is_lagrange():
     assert bool(inside.all())
     _, outside = resample_polynomial(padded_t, padded_v, jnp.asarray(12.0), jnp.asarray([-1.0, 2.0]))
     assert not outside.any()
+
+
+def test_of_samples_of_one_time_the_first_counts():
+    time_s, twice = np.arange(8) * 0.02, np.array([0, 1, 2, 2, 3, 4, 4, 5, 6, 7])
+    curve = 1.0 + 3.0 * time_s - 20.0 * time_s**2
+    query = jnp.asarray([0.0, 0.03, 0.045, 0.05, 0.075, 0.09, 0.14], jnp.float32)
+    out, inside = resample_polynomial(
+        jnp.asarray(time_s[twice], jnp.float32), jnp.asarray(curve[twice], jnp.float32), jnp.asarray(10.0), query
+    )
+    np.testing.assert_allclose(out, 1.0 + 3.0 * query - 20.0 * query**2, atol=1e-5)
+    assert bool(inside.all())
 
 
 def test_coherence_is_1_for_the_true_distance_whatever_the_channel_offsets():

@@ -18,7 +18,7 @@ def resample_polynomial(
 ) -> tuple[Float[Array, " query"], Bool[Array, " query"]]:
     """Lagrange interpolation through the `order` + 1 samples around each query time.
 
-    The first `num_valid` samples count; they are in order of time. Returns values and whether the query lies within
+    The first `num_valid` samples count; they are in order of time, and of those of one time the first counts. Returns values and whether the query lies within
     the samples; outside, the nearest sample is repeated.
     """
     count = num_valid.astype(jnp.int32)
@@ -30,6 +30,7 @@ def resample_polynomial(
     member = index < count
     index = jnp.minimum(index, time_s.shape[0] - 1)
     t, y = time_s[index], value[index]
+    member = member.at[:, 1:].set(member[:, 1:] & (t[:, 1:] > t[:, :-1]))
     own = jnp.eye(order + 1, dtype=bool)[None]
     pair = ~own & member[:, None, :] & member[:, :, None]
     apart = t[:, :, None] - t[:, None, :]

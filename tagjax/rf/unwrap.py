@@ -32,7 +32,7 @@ def unwrap_paper(reads: PhaseReads) -> Float[Array, " reads"]:
     Steps between reads of one channel are unwrapped by thresholds; at a channel change the distance is held. A step
     whose velocity differs from the one before by more than 9.8 m/s^2 allows is replaced by the previous velocity
     times the elapsed time. (Measured against the previous kept velocity instead, one refusal can lead to the next for
-    good.) Invalid reads repeat the value before them.
+    good; only after a channel change, which measures none, is it the kept one.) Invalid reads repeat the value before them.
     """
 
     def advance(carry, read):
@@ -41,10 +41,10 @@ def unwrap_paper(reads: PhaseReads) -> Float[Array, " reads"]:
         gap = jnp.maximum(time - last_time, 1e-6)
         step = phase_to_distance(remove_jump(phase - last_phase), carrier)
         same = channel == last_channel
-        new_velocity = jnp.where(same, step / gap, raw)
+        new_velocity = jnp.where(same, step / gap, velocity)
         too_much = jnp.abs(new_velocity - raw) / (0.5 * (gap + last_gap)) > MAX_ACCELERATION_M_S2
         # There is no acceleration before there are two velocities.
-        too_much = too_much & (seen >= 2)
+        too_much = too_much & same & (seen >= 2)
         kept_velocity = jnp.where(too_much, velocity, new_velocity)
         kept_step = jnp.where(same, jnp.where(too_much, velocity * gap, step), 0.0)
         use = valid & (seen >= 1)
