@@ -9,14 +9,25 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-_FREE = ("loop", "logger", "distributed", "resume", "scores", "baselines", "baseline_estimators", "matmul_precision")
+_FREE = (
+    "loop",
+    "logger",
+    "distributed",
+    "resume",
+    "retune",
+    "scores",
+    "baselines",
+    "baseline_estimators",
+    "matmul_precision",
+)
 _FREE_ENDS = ("workers", "decay_steps")  # the latter follows loop.num_steps
+_RETUNED = ("clip_norm", "optimizer", "joint.optimizer")
 
 
 def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
     """Write `config.yaml`, where the run is new or goes on as it was configured.
 
-    Length, logs, scores and processes may change when a run goes on. Raises `ValueError`, naming what differs, where
+    Length, logs, scores and processes may change when a run goes on, with `retune` the optimiser as well. Raises `ValueError`, naming what differs, where
     anything else does, and leaves the file as it was; also where the run may not go on, which the run itself refuses.
     """
     path = folder / "config.yaml"
@@ -24,11 +35,12 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
         if not values.get("resume", True):
             return
         before = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-        differ = _differences(before, dict(values))
+        retuned = values.get("retune", False)
+        differ = _differences(before, dict(values), free=(*_FREE, *_RETUNED) if retuned else _FREE)
         if differ:
             raise ValueError(
                 f"{folder} holds a run that was configured otherwise: {'; '.join(differ)}. Give the same settings to go on "
-                "with it, or another folder."
+                "with it (retune=true lets the optimiser and clip_norm change), or another folder."
             )
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     OmegaConf.save(OmegaConf.create(dict(values)), beside)
@@ -40,14 +52,14 @@ def checkpoint_steps(folder: Path) -> list[int]:
     return [int(path.name) for path in (folder / "checkpoints").glob("*") if path.name.isdigit()]
 
 
-def _differences(before: Any, now: Any, where: str = "") -> list[str]:
-    if where in _FREE or where.rpartition(".")[2] in _FREE_ENDS:
+def _differences(before: Any, now: Any, where: str = "", *, free: tuple[str, ...]) -> list[str]:
+    if where in free or where.rpartition(".")[2] in _FREE_ENDS:
         return []
     if isinstance(before, dict) and isinstance(now, dict):
         names = [*now, *(name for name in before if name not in now)]
         return [
             text
             for name in names
-            for text in _differences(before.get(name), now.get(name), f"{where}.{name}".lstrip("."))
+            for text in _differences(before.get(name), now.get(name), f"{where}.{name}".lstrip("."), free=free)
         ]
     return [] if before == now else [f"{where} was {before!r} and is {now!r}"]

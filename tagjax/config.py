@@ -138,6 +138,7 @@ class TrainConfig:
     seed: int = 0
     clip_norm: float = 1.0
     resume: bool = True  # go on from the run folder's newest checkpoint, if it holds one
+    retune: bool = False  # then with another clip_norm or optimiser than it was begun with
     joint: JointSettings | None = None  # without it flow is `data.clips.flow`, computed once
     data: DataSettings = dataclasses.field(default_factory=DataSettings)
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
@@ -161,6 +162,7 @@ class TrainFlowConfig:
         None  # of products; None is JAX's default
     )
     resume: bool = True
+    retune: bool = False
     data: FlowDataSettings = dataclasses.field(default_factory=FlowDataSettings)
     loss: FlowLossSettings = dataclasses.field(default_factory=FlowLossSettings)
     loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)

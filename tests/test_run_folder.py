@@ -36,6 +36,17 @@ def test_another_configuration_is_refused_by_name_and_changes_nothing(tmp_path: 
         assert OmegaConf.load(tmp_path / "config.yaml") == VALUES
 
 
+def test_the_optimiser_changes_only_where_that_is_asked_for(tmp_path: Path) -> None:
+    slower = {**VALUES, "optimizer": {"decay_steps": 4, "learning_rate": 0.001}, "clip_norm": 0.1}
+    folder = _begun(tmp_path)
+    with pytest.raises(ValueError, match=r"clip_norm was None and is 0\.1.*retune=true lets"):
+        keep_configuration(folder, slower)
+    with pytest.raises(ValueError, match="seed was 0 and is 3"):
+        keep_configuration(folder, {**slower, "retune": True, "seed": 3})
+    keep_configuration(folder, {**slower, "retune": True})
+    assert OmegaConf.load(tmp_path / "config.yaml") == {**slower, "retune": True}
+
+
 def test_what_may_not_go_on_leaves_the_file_as_it_was(tmp_path: Path) -> None:
     keep_configuration(_begun(tmp_path), {**VALUES, "resume": False, "seed": 5})
     assert OmegaConf.load(tmp_path / "config.yaml") == VALUES

@@ -183,7 +183,7 @@ def train(
 def _diverged(checkpoints: Checkpoints, done: int, skipped: int) -> str:
     good = [step for step in checkpoints.steps() if step <= done - skipped]
     there = (
-        f"the last good checkpoint is step {good[-1]} in {checkpoints.folder}. Go on from there"
+        f"the last good checkpoint is step {good[-1]} in {checkpoints.folder}. Go on from there by retune=true"
         if good
         else f"no checkpoint was written before them in {checkpoints.folder}. Start again"
     )
