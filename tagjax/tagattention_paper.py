@@ -36,6 +36,8 @@ class PaperState(eqx.Module):
 class TagAttentionPaper(AbstractTracer):
     """Eqs. 3-7 with the paper's constants. `softness` > 0 relaxes every hard step; 0 is the paper."""
 
+    one_antenna = True
+
     alpha_m2: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=5e-4)
     beta: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.8)
     v0_m_s: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.1)

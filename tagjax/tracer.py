@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -72,6 +72,9 @@ class Trace(eqx.Module):
 
 class AbstractTracer(eqx.Module):
     """A tracing system as a state machine of fixed shapes: `init`, one `step` a frame, `finish`."""
+
+    one_antenna: ClassVar[bool] = False
+    """Whether it knows the distance to one antenna only."""
 
     @abc.abstractmethod
     def init(self, camera: Camera, frame: Frame) -> Any:

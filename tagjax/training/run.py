@@ -272,7 +272,8 @@ def evaluate_tracers(
 ) -> dict[str, Any]:
     """Run each tracer over each recording, write the report into `folder` and return its summary.
 
-    `estimators` and `flows` name the radio estimator and the flow of tracers that do not take the clips' own. With
+    `estimators` and `flows` name the radio estimator and the flow of tracers that do not take the clips' own; a tracer that
+    knows one antenna gets the busiest one, whatever the clips say. With
     `settings.smooth` those that can smooth do, which their names tell; the others go forwards only. Raises `ConfigError`
     where none can.
     """
@@ -280,10 +281,13 @@ def evaluate_tracers(
     loaders = {
         name: clip_loader(
             dataclasses.replace(
-                clips, estimator=estimators.get(name, clips.estimator), flow=flows.get(name, clips.flow)
+                clips,
+                estimator=estimators.get(name, clips.estimator),
+                flow=flows.get(name, clips.flow),
+                antennas=None if tracer.one_antenna else clips.antennas,
             )
         )
-        for name in tracers
+        for name, tracer in tracers.items()
     }
     smooth = smoothed(tracers, settings)
     shown = {name: f"{name}_smoothed" if name in smooth else name for name in tracers}
