@@ -261,6 +261,13 @@ def test_of_many_tags_the_one_that_moves_most_is_kept_and_others_by_chance() -> 
     again = [one.epcs for _, one in zip(range(2), clip_dataset([both], most_tags=3, **settings), strict=False)]
     assert again == kept[:2]
     assert len(next(iter(clip_dataset([both], **settings))).epcs) == 8
+    # Antenna 2 is the busiest of all tags, antenna 1 that of the ones that move: whoever is drawn, it is the former.
+    elsewhere = [dataclasses.replace(one, antenna=np.full(one.num_reads, 2, np.int16)) for one in still]
+    apart = dataclasses.replace(recording, reads=join_reads([reads, *elsewhere]), antennas_m=ANTENNAS_M)
+    with pytest.warns(RecordingWarning, match=r"to antenna 2\."):
+        drawn = next(iter(clip_dataset([apart], most_tags=1, least_motion=0.0, **settings)))
+    assert len(drawn.epcs) == 1
+    np.testing.assert_allclose(drawn.camera.antennas_m, ANTENNAS_M[1:2], atol=1e-6)
     assert len(next(iter(clip_dataset([both], most_tags=20, **settings))).epcs) == 8
     with pytest.raises(ValueError, match="most_tags is 0; expected at least 1 tag"):
         clip_dataset([both], most_tags=0, **settings)

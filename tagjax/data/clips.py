@@ -63,7 +63,7 @@ def check_clip(*, stride: int = 1, window: int = 2, max_reads: int = 1) -> None:
 def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antennas = None) -> tuple[int, ...]:
     """The antennas (counted from 1) that distances are to: the given ones, all, or the one with the most reads (None).
 
-    All are those that `antennas_m` places and that have read one of the tags; with None, reads of known carrier count
+    All are those that `antennas_m` places and that have read one of the tags (given ones: any tag); with None, reads of known carrier count
     before others, and of equals the first antenna. Warns (`RecordingWarning`) of the reads that are of no use then.
     Raises `RecordingError` where no antenna is left.
     """
@@ -82,7 +82,8 @@ def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antenna
         chosen = placed if antennas == "all" else (most,)
     else:
         chosen = antennas
-        if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(placed):
+        heard = {port for port in np.unique(recording.reads.antenna).tolist() if 1 <= port <= num_placed}
+        if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= heard:
             raise RecordingError(
                 f"{recording.name}: antennas {', '.join(map(str, chosen)) or 'none'} asked for; antennas_m places antennas 1 to "
                 f"{num_placed}, and the tags' reads are: {made}. Choose antennas that have both, each once."
@@ -284,7 +285,7 @@ class _ClipSource:
     ):
         self._recordings, self._length, self._settings = list(recordings), length, settings
         self._on_host = on_host  # NumPy arrays, which one process can hand to another
-        self._places: list[tuple[int, int, tuple[str, ...]]] = []
+        self._places: list[tuple[int, int, tuple[str, ...], tuple[int, ...]]] = []
         if all(recording.num_frames < length for recording in recordings):
             longest = max((recording.num_frames for recording in recordings), default=0)
             raise RecordingError(
@@ -311,7 +312,7 @@ class _ClipSource:
             for start, of_tags in zip(starts, heard, strict=True):
                 if of_tags.max() >= least_motion:
                     drawn = _drawn_tags(of_tags, most_tags, (number, start))
-                    self._places.append((number, start, tuple(named[tag] for tag in drawn)))
+                    self._places.append((number, start, tuple(named[tag] for tag in drawn), chosen))
             most_heard = max(most_heard, float(heard.max()))
         if not self._places:
             raise RecordingError(
@@ -324,8 +325,9 @@ class _ClipSource:
         return len(self._places)
 
     def __getitem__(self, index) -> Clip:
-        number, start, epcs = self._places[int(index)]
-        clip = load_clip(self._recordings[number], start, start + self._length, epcs=epcs, **self._settings)
+        number, start, epcs, antennas = self._places[int(index)]
+        settings = self._settings | {"antennas": antennas}  # of all its tags, whichever were drawn
+        clip = load_clip(self._recordings[number], start, start + self._length, epcs=epcs, **settings)
         return jax.tree.map(np.asarray, clip) if self._on_host else clip
 
 
