@@ -55,21 +55,31 @@ def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[
 
     `source` is a file of `save_parameters`, the name of packaged parameters, or `default`: those that were learned from
     these very `settings` (of several packaged ones all but one say `"default": false`, and are given by name). Raises `ValueError` where there are none, for a file that is damaged, foreign, or of
-    another tracer, and where `settings` ask for other initial values than it was learned from.
+    another tracer, and where `settings` ask for other initial values than it was learned from; of a parameter that did
+    not move in learning any value may be asked for.
     """
     path = _default_for(settings) if str(source) == "default" else _find(source)
     content = _read(path)
+    learned = dict(content["parameters"])
     for name, default in _learnable(tracer).items():
         began, asked = (given.get(name, default) for given in (content["settings"], settings))
-        if asked != began:
+        if asked != began and name in _unmoved(content):
+            learned[name] = asked
+        elif asked != began:
             raise ValueError(
                 f"{path}: learned from {name}={began!r}, and what was learned takes its place, but {name}={asked!r} is "
                 f"asked for: leave {name} as it was, or weights= out."
             )
     try:
-        return tracer.with_physical(content["parameters"])
+        return tracer.with_physical(learned)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _unmoved(content: Mapping[str, Any]) -> set[str]:
+    """Parameters of a file that are what learning began from."""
+    began = content["settings"]
+    return {name for name, value in content["parameters"].items() if name in began and value == began[name]}
 
 
 def _learnable(tracer: TagAttention) -> dict[str, Any]:
@@ -95,7 +105,9 @@ def _default_for(settings: Mapping[str, Any]) -> Path:
     for name in packaged_parameters():
         path = PACKAGED / f"{name}.json"
         content = _read(path)
-        if content.get("default", True) and content["settings"] == dict(settings):
+        free = _unmoved(content)
+        began, asked = ({k: v for k, v in one.items() if k not in free} for one in (content["settings"], settings))
+        if content.get("default", True) and began == asked:
             return path
     there = ", ".join(packaged_parameters()) or "none"
     raise ValueError(

@@ -19,6 +19,7 @@ from tagjax.learned import load_parameters, packaged_parameters, save_parameters
 from tagjax.tagattention import TagAttention
 from tagjax.training.run import make_tracer
 
+CONF = str((Path(__file__).parents[1] / "conf").resolve())
 SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
 
 
@@ -69,6 +70,22 @@ def _changed(path: Path, **changes: Any) -> Path:
     return other
 
 
+@pytest.mark.parametrize("weights", ["default", "tagattention", "things_in_hand"])
+def test_what_did_not_move_in_learning_may_be_asked_for(weights: str) -> None:
+    """`tracer.rest_doubt=0.2` with packaged parameters, as docs/learning.md advises."""
+    with initialize_config_dir(CONF, version_base="1.3"):
+        plain, doubting = (
+            OmegaConf.to_container(compose("train", ["tracer=tagattention", *more]).tracer, resolve=True)
+            for more in ([], ["tracer.rest_doubt=0.2"])
+        )
+    without, with_doubt = (make_tracer(one, weights) for one in (plain, doubting))
+    assert isinstance(without, TagAttention)
+    assert isinstance(with_doubt, TagAttention)
+    told = with_doubt.physical()
+    assert told.pop("rest_doubt") == pytest.approx(0.2)
+    assert told == {name: value for name, value in without.physical().items() if name != "rest_doubt"}
+
+
 def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     tracer = TagAttention(cell=4)
     path = tmp_path / "weights.json"
@@ -105,7 +122,7 @@ def test_a_tracer_without_learned_parameters_says_so() -> None:
 
 
 def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:
-    with initialize_config_dir(str((Path(__file__).parents[1] / "conf").resolve()), version_base="1.3"):
+    with initialize_config_dir(CONF, version_base="1.3"):
         composed = OmegaConf.to_container(compose("train", ["tracer=tagattention"]), resolve=True)
     assert isinstance(composed, dict)
     assert packaged_parameters() == ("tagattention", "things_in_hand")
