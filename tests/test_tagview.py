@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
+from scipy.stats import norm
 
 from tagjax.baselines.tagview import (
     Heard,
@@ -25,6 +26,7 @@ from tagjax.baselines.tagview import (
     identify,
     interpolate,
     keep_edges,
+    likelihood_weight,
     match_graph,
     pieces,
     select_edges,
@@ -311,8 +313,9 @@ def _brute(weight, quadratic, rows):
     return best
 
 
+@pytest.mark.parametrize("signed", [False, True])
 @pytest.mark.parametrize("seed", range(12))
-def test_the_programme_is_solved_exactly(seed):
+def test_the_programme_is_solved_exactly(seed, signed):
     rng = np.random.default_rng(seed)
     num_traces, num_tags = int(rng.integers(2, 5)), int(rng.integers(2, 4))
     trace, tag = np.nonzero(rng.uniform(size=(num_traces, num_tags)) < 0.85)
@@ -320,7 +323,7 @@ def test_the_programme_is_solved_exactly(seed):
     span = np.stack([begin, begin + rng.uniform(0.5, 2, num_traces)], axis=1)
     rows = cliques(trace, tag, span, tolerance_s=0.0)
     upper = np.triu(rng.uniform(size=(len(trace),) * 2))
-    quadratic, weight = 0.5 * (upper + upper.T), rng.uniform(-0.5, 1, len(trace))
+    quadratic, weight = 0.5 * (upper + upper.T) - 0.4 * signed, rng.uniform(-0.5, 1, len(trace))
     found = select_edges(weight, quadratic, rows)
     assert all(found.chosen[row].sum() <= 1 for row in rows)
     assert found.value == pytest.approx(_brute(weight, quadratic, rows), abs=1e-6)
@@ -352,8 +355,8 @@ def test_a_short_time_limit_still_gives_a_bound():
 
 def test_the_programme_refuses_what_it_cannot_solve():
     assert select_edges(np.zeros(0), np.zeros((0, 0)), []).chosen.shape == (0,)
-    with pytest.raises(ValueError, match="negative"):
-        select_edges(np.ones(2), -np.ones((2, 2)), [])
+    with pytest.raises(ValueError, match="not symmetric"):
+        select_edges(np.ones(2), np.array([[0.0, 1.0], [0.0, 0.0]]), [])
     with pytest.raises(ValueError, match="finite"):
         select_edges(np.array([np.nan, 1.0]), np.zeros((2, 2)), [])
 
@@ -364,6 +367,30 @@ def test_edges_have_no_agreement_with_themselves():
     quadratic = edge_agreement(table, trace, tag)
     assert quadratic[0, 2] == table[0, 1, 0, 1]
     np.testing.assert_array_equal(np.diag(quadratic), 0.0)
+
+
+def test_agreement_counts_from_even_odds_where_it_is_weighed_by_time():
+    table = np.random.default_rng(0).uniform(size=(2, 2, 2, 2))
+    trace, tag = np.array([0, 1, 1]), np.array([0, 0, 1])
+    quadratic = edge_agreement(table, trace, tag, np.array([[9.0, 4.0], [4.0, 7.0]]))
+    assert quadratic[0, 2] == pytest.approx(4.0 * (table[0, 1, 0, 1] - 0.5))
+    np.testing.assert_array_equal(np.diag(quadratic), 0.0)
+    assert not np.any(edge_agreement(np.full((2, 2, 2, 2), 0.5), trace, tag, np.ones((2, 2))))
+
+
+def test_a_line_weighs_its_likelihood_ratio():
+    rng = np.random.default_rng(0)
+    x, noise = rng.normal(size=400), rng.normal(size=400)
+    y = 2.0 * x + noise
+    slope, intercept = np.polyfit(x, y, 1)
+    line, constant = np.mean((y - slope * x - intercept) ** 2), np.var(y)
+    ratio = (
+        norm.logpdf(y, slope * x + intercept, np.sqrt(line)).sum() - norm.logpdf(y, y.mean(), np.sqrt(constant)).sum()
+    )
+    weight = likelihood_weight(np.array([[1.0 - line / constant, 0.0]]), np.array([[400.0, 400.0]]))
+    assert weight[0, 0] == pytest.approx(ratio, rel=0.05)  # R^2 counts 0.99 of itself
+    assert weight[0, 1] == 0.0
+    assert np.isfinite(likelihood_weight(np.ones((1, 1)), np.full((1, 1), 9.0))).all()
 
 
 # Reads
@@ -434,6 +461,8 @@ def test_settings_are_checked():
         MatchSettings(least_samples=2)
     with pytest.raises(ValueError, match="threshold"):
         MatchSettings(threshold=0.0)
+    with pytest.raises(ValueError, match="independent_s is 0"):
+        MatchSettings(independent_s=0.0)
 
 
 # All together

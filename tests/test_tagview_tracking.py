@@ -447,6 +447,15 @@ def test_a_thing_that_was_hidden_is_named_again():
     np.testing.assert_array_equal(found.tag_of, seen.owner)
 
 
+def test_what_led_to_a_tracks_confirmation_belongs_to_its_trace():
+    recording = _recording(hidden=range(30, 42))
+    tracer = TagviewTracer(dataclasses.replace(_tracer().settings, memory_s=1e9), detector=Perfect())
+    seen = watch(tracer, recording)
+    for thing, true_px in enumerate(seen.truth_px):
+        own = np.isfinite(seen.box_px[seen.owner == thing, :, 0]).any(axis=0)
+        np.testing.assert_array_equal(own, np.isfinite(true_px[:, 0]))
+
+
 # Evaluation
 
 

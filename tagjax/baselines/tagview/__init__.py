@@ -18,6 +18,7 @@ from ._graph import Coefficient as Coefficient
 from ._graph import cliques as cliques
 from ._graph import edge_agreement as edge_agreement
 from ._graph import keep_edges as keep_edges
+from ._graph import likelihood_weight as likelihood_weight
 from ._graph import match_graph as match_graph
 from ._graph import shared_coefficient as shared_coefficient
 from ._hermite import interpolate as interpolate

@@ -19,6 +19,7 @@ from ._graph import (
     cliques,
     edge_agreement,
     keep_edges,
+    likelihood_weight,
     match_graph,
     shared_coefficient,
 )
@@ -26,6 +27,7 @@ from ._programme import Selection, select_edges
 from ._reads import Heard, TagSequences
 
 Origin = Literal["principal", "antenna"]
+Weigh = Literal["r_squared", "likelihood"]
 
 _PAD_TRACES = 8
 
@@ -36,6 +38,8 @@ class MatchSettings:
 
     threshold: float = 3.0  # eta, of the z-score; the paper does not give it
     mu: float = 0.5  # weight of the agreement; 0 leaves strengths out
+    weigh: Weigh = "r_squared"  # ours: likelihood weighs fits and agreement by how much was seen, in nats
+    independent_s: float = 0.5  # ours, of likelihood: errors this far apart count as independent
     programme: bool = True  # False ends with the Hungarian matching of V.A
     spread: Spread = "std"  # ours: mad
     least_spread: float = 0.5  # ours: of the shared coefficient, as a share of it; short traces scatter so much
@@ -51,6 +55,10 @@ class MatchSettings:
             raise ValueError(f"spread is {self.spread!r}; expected std or mad.")
         if self.origin not in ("principal", "antenna"):
             raise ValueError(f"origin is {self.origin!r}; expected principal or antenna.")
+        if self.weigh not in ("r_squared", "likelihood"):
+            raise ValueError(f"weigh is {self.weigh!r}; expected r_squared or likelihood.")
+        if not self.independent_s > 0:
+            raise ValueError(f"independent_s is {self.independent_s}; expected a positive time.")
         if not (self.threshold > 0 and self.mu >= 0 and self.least_spread >= 0 and self.time_limit_s > 0):
             raise ValueError(
                 f"threshold {self.threshold}, mu {self.mu}, least_spread {self.least_spread}, time_limit_s "
@@ -73,6 +81,11 @@ class Traces:
         """First and last time each trace was seen."""
         rows = [np.flatnonzero(one) for one in self.seen]
         return np.array([(self.time_s[row[0]], self.time_s[row[-1]]) for row in rows]).reshape(-1, 2)
+
+    def step_s(self) -> float:
+        """Time from frame to frame, the median; 1 where there is none."""
+        steps = np.diff(self.time_s)
+        return float(np.median(steps[steps > 0])) if np.any(steps > 0) else 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,12 +134,17 @@ def identify(
     selection, tag_of = None, matched
     if settings.programme:
         trace, tag = np.nonzero(kept)
-        quadratic = np.zeros((len(trace), len(trace)))
+        quadratic, worth, together = np.zeros((len(trace), len(trace))), weight, None
+        if settings.weigh == "likelihood":
+            apart = settings.independent_s / traces.step_s()  # frames
+            worth = likelihood_weight(weight, np.asarray(fit.count, np.float64) / apart)
+            seen = traces.seen.astype(np.float64)
+            together = seen @ seen.T / apart
         if settings.mu > 0 and len(trace):
             _, agreed = _fits(traces, heard.sequences, focal_px, foot, with_agreement=True)
-            quadratic = settings.mu * edge_agreement(np.asarray(agreed), trace, tag)
+            quadratic = settings.mu * edge_agreement(np.asarray(agreed), trace, tag, together)
         rows = cliques(trace, tag, traces.spans_s(), tolerance_s=settings.overlap_s)
-        selection = select_edges(weight[trace, tag], quadratic, rows, time_limit_s=settings.time_limit_s)
+        selection = select_edges(worth[trace, tag], quadratic, rows, time_limit_s=settings.time_limit_s)
         tag_of = unnamed.copy()
         tag_of[trace[selection.chosen]] = tag[selection.chosen]
     height_m = float("nan") if shared is None else _height_m(shared, heard.wavelength_m)

@@ -34,34 +34,34 @@ def select_edges(
 ) -> Selection:
     """max_x x^T Q x + w^T x, x binary, at most one edge of every clique: Eq. 10 with mu within Q.
 
-    Q is symmetric and not negative. Its diagonal counts too (Eq. 9 leaves the agreement of an edge with itself open;
-    `edge_agreement` sets 0). Each product x_e x_f of edges that may go together becomes a variable y_ef, 0 to 1. For an
-    edge e and a clique K without it, x_e times "at most one of K" gives sum_{f in K} y_ef <= x_e: the linear programme
-    is far tighter than with y_ef <= x_e one by one, and mostly whole at the root. HiGHS ends at the optimum, or with
+    Q is symmetric. Its diagonal counts too (Eq. 9 leaves the agreement of an edge with itself open; `edge_agreement` sets
+    0). Each product x_e x_f of edges that may go together becomes a variable y_ef, 0 to 1. For an edge e and a clique K
+    without it, x_e times "at most one of K" gives sum_{f in K} y_ef <= x_e: the linear programme is far tighter than with
+    y_ef <= x_e one by one, and mostly whole at the root. Where Q is negative, y_ef >= x_e + x_f - 1. HiGHS ends at the optimum, or with
     the proven bound at the time limit; at worst nothing is chosen and the bound is the sum of all. Raises `ValueError`
-    for Q that is negative, not symmetric, or not finite.
+    for Q that is not symmetric or not finite.
     """
     weight, quadratic = np.asarray(weight, np.float64), np.asarray(quadratic, np.float64)
     num = len(weight)
     if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(quadratic))):
         raise ValueError("Weights or agreements are not finite; expected numbers.")
-    if np.any(quadratic < 0) or not np.allclose(quadratic, quadratic.T):
-        raise ValueError("The quadratic term is negative somewhere or not symmetric; expected agreements, 0 to 1.")
+    if not np.allclose(quadratic, quadratic.T):
+        raise ValueError("The quadratic term is not symmetric; expected what every two edges are worth together.")
     linear = weight + np.diag(quadratic)
     if num == 0:
         return Selection(np.zeros(0, bool), 0.0, 0.0)
     apart = np.zeros((num, num), bool)
     for clique in cliques:
         apart[np.ix_(clique, clique)] = True
-    first, second = np.nonzero(np.triu(~apart & (quadratic > 0), 1))
+    first, second = np.nonzero(np.triu(~apart & (quadratic != 0), 1))
     product = np.full((num, num), -1)
     product[first, second] = product[second, first] = num + np.arange(len(first))
     cost = -np.concatenate([linear, 2.0 * quadratic[first, second]])
-    limits = _rows(num, product, cliques, len(cost))
+    limits = _rows(num, product, quadratic < 0, cliques, len(cost))
     integrality = np.concatenate([np.ones(num), np.zeros(len(first))])
     options = {"time_limit": time_limit_s, "mip_rel_gap": 0.0}
     found = milp(cost, integrality=integrality, bounds=Bounds(0, 1), constraints=limits, options=options)
-    worst = float(linear[linear > 0].sum() + 2.0 * quadratic[first, second].sum())
+    worst = float(np.maximum(linear, 0.0).sum() + 2.0 * np.maximum(quadratic[first, second], 0.0).sum())
     bound = worst if found.mip_dual_bound is None else min(worst, -float(found.mip_dual_bound))
     chosen = np.zeros(num, bool) if found.x is None else found.x[:num] > 0.5
     value = float(linear @ chosen + quadratic[np.ix_(chosen, chosen)].sum() - np.diag(quadratic)[chosen].sum())
@@ -69,9 +69,13 @@ def select_edges(
 
 
 def _rows(
-    num: int, product: Int[np.ndarray, "edges edges"], cliques: Sequence[Int[np.ndarray, " _"]], size: int
+    num: int,
+    product: Int[np.ndarray, "edges edges"],
+    negative: Bool[np.ndarray, "edges edges"],
+    cliques: Sequence[Int[np.ndarray, " _"]],
+    size: int,
 ) -> list[LinearConstraint]:
-    """P x <= 1, and the products of its rows with each edge."""
+    """P x <= 1, and what ties each product to its edges: from above where it is worth something, else from below."""
     row, column, entry, upper = [], [], [], []
 
     def add(places: Sequence[int], values: Sequence[float], limit: float) -> None:
@@ -82,6 +86,9 @@ def _rows(
 
     for clique in cliques:
         add(clique.tolist(), [1.0] * len(clique), 1.0)
+    for edge, other in zip(*np.nonzero(np.triu((product >= 0) & negative)), strict=True):
+        add([int(edge), int(other), int(product[edge, other])], [1.0, 1.0, -1.0], 1.0)
+    product = np.where(negative, -1, product)
     for edge in range(num):
         loose = product[edge] >= 0
         for clique in cliques:

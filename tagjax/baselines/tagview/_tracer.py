@@ -56,7 +56,8 @@ class ViewState:
 
     detector: Any
     tracks: BoxTracks
-    boxes: tuple[tuple[float, Mapping[int, np.ndarray]], ...]  # time, box of each confirmed track seen then
+    boxes: tuple[tuple[float, Mapping[int, np.ndarray]], ...]  # time, box of each track seen then
+    confirmed: frozenset[int]  # of these; what led to a track's confirmation belongs to it
     reads: tuple[tuple[TagReads, np.ndarray], ...]  # of each frame, with their times
     named: Mapping[int, int]  # tag of each track, index into the tags asked for
     confidence: Mapping[int, float]  # of that, by track
@@ -85,7 +86,7 @@ class TagviewTracer(AbstractHostTracer):
         return None
 
     def init(self, camera: HostCamera) -> ViewState:
-        return ViewState(self.detector.begin(), BoxTracks(), (), (), {}, {}, float("nan"), -np.inf)
+        return ViewState(self.detector.begin(), BoxTracks(), (), frozenset(), (), {}, {}, float("nan"), -np.inf)
 
     def step(self, camera: HostCamera, state: ViewState, frame: HostFrame) -> tuple[ViewState, Trace]:
         after = self.see(state, frame)
@@ -109,15 +110,19 @@ class TagviewTracer(AbstractHostTracer):
         """The frame's boxes and reads remembered, with nothing decided."""
         seen, boxes, _ = self.detector.detect(state.detector, frame.colour)
         tracks = track_boxes(state.tracks, boxes, self.settings.tracks)
-        here = {one.number: one.box_px for one in tracks.tracks if one.missed == 0 and one.confirmed}
+        here = {one.number: one.box_px for one in tracks.tracks if one.missed == 0}
         start_s = frame.time_s - self.settings.memory_s
+        boxes_seen = (*(entry for entry in state.boxes if entry[0] >= start_s), (frame.time_s, here))
+        known = set().union(*(there for _, there in boxes_seen))
+        confirmed = (state.confirmed & known) | {one.number for one in tracks.tracks if one.confirmed}
         useful = useful_reads(frame.reads, self.settings.reads.antenna)
         new = ((frame.reads[useful], frame.read_time_s[useful]),) if useful.any() else ()
         return dataclasses.replace(
             state,
             detector=seen,
             tracks=tracks,
-            boxes=(*(entry for entry in state.boxes if entry[0] >= start_s), (frame.time_s, here)),
+            boxes=boxes_seen,
+            confirmed=frozenset(confirmed),
             reads=(*(entry for entry in state.reads if entry[1][-1] >= start_s), *new),
         )
 
@@ -162,7 +167,7 @@ class TagviewTracer(AbstractHostTracer):
         time_s = np.array([time for time, _ in state.boxes], np.float64)
         spans: dict[int, list[float]] = {}
         for time, here in state.boxes:
-            for number in here:
+            for number in here.keys() & state.confirmed:
                 spans.setdefault(number, [time, time])[1] = time
         number = tuple(sorted(n for n, (a, b) in spans.items() if b - a >= self.settings.least_trace_s))
         missing = np.full(4, np.nan)
