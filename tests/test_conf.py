@@ -110,7 +110,7 @@ def test_the_comparison_takes_each_system_as_its_own_experiments_do() -> None:
     assert systems["goller"] == _compose("goller")["settings"]
     # What is claimed on the way is one of the settings that are compared on the same tracks.
     assert vision["matching"]["adapted"] == vision["system"]["match"]
-    assert view["matching"]["no_rssi"] == {name: view["system"][name] for name in ("reads", "match")}
+    assert view["matching"][view["whole"]] == {name: view["system"][name] for name in ("reads", "match")}
     for name, tracer in (("people", "tagattention"), ("handheld", "tagattention_handheld")):
         assert systems["tagattention"][name]["tracer"] == _compose("train", f"tracer={tracer}")["tracer"]
 
