@@ -142,7 +142,8 @@ def load_clip(
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
     `stride` keeps every n-th pixel in both directions. The radio is estimated from the recording's start, causally, so
-    that a clip in the middle knows its past. `antennas` says whose reads are used and to where distances
+    that a clip in the middle knows its past; what is the reader's and does not change (share of pi flips, slope and
+    spread of the channels' offsets, mean carrier: `radio_model`) is read off all of the tag's reads first. `antennas` says whose reads are used and to where distances
     are (see `choose_antennas`). With `colour` the clip holds its pictures, and zero in place of the flow, which is
     then a network's to make. Raises `RecordingError` for an unknown EPC or antenna or a recording without depth, and
     `ValueError` for frames outside the recording or settings that no clip can have.

@@ -72,7 +72,11 @@ def phase_reads(
 
 
 def radio_model(reads: PhaseReads, **settings: float) -> RadioModel:
-    """A `RadioModel` with the pi-flip share and the affine channel offset read off the reads themselves."""
+    """A `RadioModel` with the pi-flip share and the affine channel offset read off the reads themselves.
+
+    These are constants of reader and tag, fitted to all reads that are given: of a whole recording, later ones, too. To
+    trace while reads come in, fit them to an earlier recording of the same reader, or give them as `settings`.
+    """
     valid = np.asarray(reads.valid)
     host = {name: np.asarray(getattr(reads, name))[valid] for name in ("phase_rad", "time_s", "channel", "carrier_hz")}
     share = pi_flip_share(host["phase_rad"], host["time_s"], host["channel"])
