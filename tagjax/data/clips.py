@@ -327,7 +327,7 @@ class _ClipSource:
 
     def __getitem__(self, index) -> Clip:
         number, start, epcs, antennas = self._places[int(index)]
-        settings = self._settings | {"antennas": antennas}  # of all its tags, whichever were drawn
+        settings: dict[str, Any] = {**self._settings, "antennas": antennas}  # of all its tags, whichever were drawn
         clip = load_clip(self._recordings[number], start, start + self._length, epcs=epcs, **settings)
         return jax.tree.map(np.asarray, clip) if self._on_host else clip
 
