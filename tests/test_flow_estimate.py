@@ -626,7 +626,7 @@ def test_the_packaged_fast_flow_sees_a_picture_move():
 
 @pytest.mark.parametrize(
     "name",
-    ["zero", "dis_ultrafast"]
+    ["zero", "dis_ultrafast", "dis+wls"]
     + [pytest.param(name, marks=pytest.mark.ci) for name in ("pyramid_fast", "pyramid+rest")]
     + [pytest.param(name, marks=pytest.mark.slow) for name in ("pyramid", "pyramid_mid")],
 )

@@ -170,7 +170,9 @@ def estimate(flow: AbstractFlowNetwork | HostFlow, first: Any, second: Any) -> F
     one, other = _checked(first, second)
     if not isinstance(network, AbstractFlowNetwork):
         height, width = one.shape[:2]
-        forward, backward = (jnp.asarray(network(*pair), jnp.float32) for pair in ((one, other), (other, one)))
+        along = getattr(network, "along", None)  # who needs both ways for either has them once
+        ways = next(along((one, other))) if along else (network(one, other), network(other, one))
+        forward, backward = (jnp.asarray(way, jnp.float32) for way in ways)
         return _judged(forward, backward, jnp.asarray([0, 0, width - 1, height - 1], jnp.int32))
     one, place, area = _padded(network, one)
     other, _, _ = _padded(network, other)

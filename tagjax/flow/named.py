@@ -1,5 +1,5 @@
-"""Flows by name: `zero`, OpenCV's, and networks with their weights; any of them at rest where rest explains the pictures
-as well; and the flow along a video.
+"""Flows by name: `zero`, OpenCV's, and networks with their weights; any of them smoothed by how far its two ways agree,
+or at rest where rest explains the pictures as well; and the flow along a video.
 """
 
 from __future__ import annotations
@@ -11,14 +11,18 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from . import opencv
-from .estimates import NetworkFlow
+from . import opencv, wls
+from .estimates import NetworkFlow, agreement
 from .opencv import FlowFunction
-from .pictures import check_pictures
+from .pictures import as_unit, check_pictures
 from .stillness import BLOCK_PX, GAIN, GENTLE_BLOCK_PX, GENTLE_GAIN, settled
 from .weights import find_weights, load_network, packaged_weights, weights_about
+from .wls import weighted_least_squares
 
 
 class ZeroFlow:
@@ -43,6 +47,39 @@ class SettledFlow:
         return settled_along(self.flow, pictures, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
 
 
+class SmoothedFlow:
+    """Another flow, smoothed within the pictures' edges by how far the ways there and back agree (`tagjax.flow.wls`)."""
+
+    def __init__(self, flow: FlowFunction):
+        self.flow = flow
+
+    def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        ((forward, backward),) = flow_along(self.flow, (first, second))
+        return _smoothed(forward, backward, first)
+
+    def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Flow forward and backward between neighbouring pictures, each of the other's ways asked for once."""
+        pictures, again = itertools.tee(pictures)
+        for (forward, backward), (one, other) in zip(
+            flow_along(self.flow, pictures), itertools.pairwise(again), strict=True
+        ):
+            yield _smoothed(forward, backward, one), _smoothed(backward, forward, other)
+
+
+@jax.jit
+def _smoothed_by_agreement(
+    flow_px: Float[Array, "height width 2"],
+    back_px: Float[Array, "height width 2"],
+    picture: Float[Array, "height width 3"],
+) -> Float[Array, "height width 2"]:
+    return weighted_least_squares(flow_px, agreement(flow_px, back_px), picture)
+
+
+def _smoothed(flow_px: np.ndarray, back_px: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    picture, _ = check_pictures(picture, picture)
+    return np.asarray(_smoothed_by_agreement(*map(jnp.asarray, (flow_px, back_px, as_unit(picture)))))
+
+
 CLASSICAL: dict[str, Callable[[], FlowFunction]] = {"zero": ZeroFlow, **opencv.FLOWS}
 """Flows that learn nothing, by name."""
 
@@ -54,24 +91,33 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 _UNTRAINED = ("flownet_s", "flownet_c", "raft_small")
 
-AT_REST = "+rest"
-"""What the name of a flow ends with that is to be `SettledFlow`'s."""
+MANNERS: dict[str, tuple[Callable[[FlowFunction], FlowFunction], str]] = {
+    "+wls": (SmoothedFlow, wls.settings_key()),
+    "+rest": (SettledFlow, f"{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"),
+}
+"""What may follow a flow's name, one after the other: what it makes of the flow before it, and a key of its settings."""
 
 
 def taken_apart(name: str) -> tuple[str, str]:
-    """A flow's name without `AT_REST`, and that, or nothing."""
-    return (name.removesuffix(AT_REST), AT_REST) if name.endswith(AT_REST) else (name, "")
+    """A flow's name without its `MANNERS`, and those, or nothing."""
+    bare = name
+    while (last := _last_manner(bare)) is not None:
+        bare = bare.removesuffix(last)
+    return bare, name[len(bare) :]
+
+
+def _last_manner(name: str) -> str | None:
+    return next((manner for manner in MANNERS if name.endswith(manner)), None)
 
 
 def make_flow(name: str) -> FlowFunction:
     """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
 
-    `pyramid_fine:<weights.npz>` is a variant with the weights of a file, such as fine-tuned ones. With `AT_REST` after it, the same as `SettledFlow`. Raises `ValueError` for a name that is none of these, and for weights
-    that cannot be used.
+    `pyramid_fine:<weights.npz>` is a variant with the weights of a file, such as fine-tuned ones. With `MANNERS` after
+    it, in that order applied. Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
     """
-    name, rest = taken_apart(name)
-    if rest:
-        return SettledFlow(make_flow(name))
+    if (manner := _last_manner(name)) is not None:
+        return MANNERS[manner][0](make_flow(name.removesuffix(manner)))
     if name in CLASSICAL:
         return CLASSICAL[name]()
     path = _weights(name)
@@ -83,9 +129,8 @@ def flow_key(name: str) -> str:
 
     Other weights have another key, wherever they lie, and so have other settings. Errors as of `make_flow`.
     """
-    name, rest = taken_apart(name)
-    if rest:
-        return f"{flow_key(name)}{rest}-{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"
+    if (manner := _last_manner(name)) is not None:
+        return f"{flow_key(name.removesuffix(manner))}{manner}-{MANNERS[manner][1]}"
     if name in CLASSICAL:
         return name
     path = _weights(name)
@@ -102,7 +147,7 @@ def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[t
 
     A network sees each picture once. Errors as of `check_pictures`.
     """
-    if isinstance(flow, NetworkFlow | SettledFlow):
+    if isinstance(flow, NetworkFlow | SmoothedFlow | SettledFlow):
         yield from flow.along(pictures)
         return
     before = None
@@ -144,7 +189,7 @@ def _weights(name: str) -> Path:
         )
     raise ValueError(
         f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({there}), "
-        f"the path of an .npz file of weights, or <variant>:<path>; {AT_REST} may follow."
+        f"the path of an .npz file of weights, or <variant>:<path>; {' and '.join(MANNERS)} may follow."
     )
 
 
