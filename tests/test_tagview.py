@@ -12,6 +12,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.stats import norm
 
 from tagjax.baselines.tagview import (
+    SLOPE_OUTLIER_NATS,
+    Coefficient,
     Heard,
     MatchSettings,
     ReadSettings,
@@ -31,6 +33,7 @@ from tagjax.baselines.tagview import (
     pieces,
     select_edges,
     shared_coefficient,
+    slope_log_odds,
     splice_phase,
     translating_factor,
 )
@@ -393,6 +396,16 @@ def test_a_line_weighs_its_likelihood_ratio():
     assert np.isfinite(likelihood_weight(np.ones((1, 1)), np.full((1, 1), 9.0))).all()
 
 
+def test_a_slope_costs_what_a_log_normal_says_up_to_an_outliers_share():
+    shared = Coefficient(2.0, 0.1)
+    slope = 2.0 * np.exp([[0.0, 0.25, -0.5, 5.0, -5.0]])
+    expected = norm.logpdf([0.0, 0.25, -0.5], 0.0, 0.25) - norm.logpdf(0.0, 0.0, 0.25)
+    found = slope_log_odds(np.concatenate([slope, [[-2.0, 0.0, 0.0, 0.0, 0.0]]]), shared, 0.25)
+    np.testing.assert_allclose(found[0, :3], expected, atol=1e-12)
+    np.testing.assert_array_equal(found[0, 3:], -SLOPE_OUTLIER_NATS)
+    np.testing.assert_array_equal(found[1], -SLOPE_OUTLIER_NATS)
+
+
 # Reads
 
 
@@ -463,6 +476,10 @@ def test_settings_are_checked():
         MatchSettings(threshold=0.0)
     with pytest.raises(ValueError, match="independent_s is 0"):
         MatchSettings(independent_s=0.0)
+    with pytest.raises(ValueError, match=r"slope_spread is 0\.2 with weigh r_squared"):
+        MatchSettings(slope_spread=0.2)
+    with pytest.raises(ValueError, match="slope_spread is 0"):
+        MatchSettings(weigh="likelihood", slope_spread=0.0)
 
 
 # All together
@@ -578,6 +595,22 @@ def test_more_tags_than_traces_and_traces_without_a_tag():
     two = Heard(jax.tree.map(lambda x: x[jnp.array([1, 3])], heard.sequences), WAVELENGTH_M)
     found = identify(traces, two, FOCAL_PX, NADIR, MatchSettings(least_r_squared=0.8))
     np.testing.assert_array_equal(found.tag_of, [-1, 0, -1, 1])
+
+
+def test_of_likelihood_every_trace_may_be_taken_for_a_tagged_things():
+    """Of a short trace the fit alone says little: it is named by its slope, and at all where all traces are some tag's."""
+    traces, heard = _world(3, noise=0.6)
+    seen = traces.seen.copy()
+    seen[0, 6:] = False
+    short = Traces(traces.number, traces.time_s, traces.direction, seen)
+    settings = {"weigh": "likelihood", "slope_spread": 0.25, "least_samples": 4, "mu": 0.0}
+    found = identify(short, heard, FOCAL_PX, NADIR, MatchSettings(**settings, named_nats=9.0))
+    np.testing.assert_array_equal(found.tag_of, [0, 1, 2])
+    assert identify(short, heard, FOCAL_PX, NADIR, MatchSettings(**settings)).tag_of[0] == -1
+    # A thing without a tag, in sight beside those that have one, stays unnamed: a tag is in one place at a time.
+    two = Heard(jax.tree.map(lambda x: x[1:], heard.sequences), WAVELENGTH_M)
+    found = identify(traces, two, FOCAL_PX, NADIR, MatchSettings(**settings, named_nats=9.0))
+    np.testing.assert_array_equal(found.tag_of, [-1, 0, 1])
 
 
 def test_one_sample_and_equal_traces():

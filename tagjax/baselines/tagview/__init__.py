@@ -14,6 +14,7 @@ from ._fit import LineFit as LineFit
 from ._fit import fit_line as fit_line
 from ._fit import fit_pairs as fit_pairs
 from ._fit import translating_factor as translating_factor
+from ._graph import SLOPE_OUTLIER_NATS as SLOPE_OUTLIER_NATS
 from ._graph import Coefficient as Coefficient
 from ._graph import cliques as cliques
 from ._graph import edge_agreement as edge_agreement
@@ -21,6 +22,7 @@ from ._graph import keep_edges as keep_edges
 from ._graph import likelihood_weight as likelihood_weight
 from ._graph import match_graph as match_graph
 from ._graph import shared_coefficient as shared_coefficient
+from ._graph import slope_log_odds as slope_log_odds
 from ._hermite import interpolate as interpolate
 from ._match import Identification as Identification
 from ._match import MatchSettings as MatchSettings

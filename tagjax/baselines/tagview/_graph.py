@@ -12,6 +12,9 @@ from ...association import hard_assignment
 
 Spread = Literal["std", "mad"]
 
+SLOPE_OUTLIER_NATS = 8.0
+"""What a slope costs at most that no spread explains: a phase may be wrongly spliced, by e^-8 of the traces."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Coefficient:
@@ -75,6 +78,19 @@ def keep_edges(
     if shared is None:
         return np.zeros(slope.shape, bool)
     return np.abs(np.asarray(slope, np.float64) - shared.mean) <= threshold * shared.spread
+
+
+def slope_log_odds(
+    slope: Float[np.ndarray, "traces tags"], shared: Coefficient, spread: float
+) -> Float[np.ndarray, "traces tags"]:
+    """How far a pair's slope speaks for it, in nats: -(log(slope / shared) / spread)^2 / 2, `SLOPE_OUTLIER_NATS` at worst.
+
+    Observation V.1, that right pairs share one coefficient, as a likelihood where Eq. 8 prunes. Ours: on the z-score
+    a slope of half the shared one is as good as the shared one's own, if short traces scatter. A slope that is not
+    positive is an outlier's; errors of a product are even in its logarithm.
+    """
+    ratio = np.maximum(np.asarray(slope, np.float64) / max(shared.mean, 1e-9), 1e-6)
+    return np.maximum(-0.5 * np.square(np.log(ratio) / spread), -SLOPE_OUTLIER_NATS)
 
 
 def cliques(

@@ -22,6 +22,7 @@ from ._graph import (
     likelihood_weight,
     match_graph,
     shared_coefficient,
+    slope_log_odds,
 )
 from ._programme import Selection, select_edges
 from ._reads import Heard, TagSequences
@@ -40,6 +41,12 @@ class MatchSettings:
     mu: float = 0.5  # weight of the agreement; 0 leaves strengths out
     weigh: Weigh = "r_squared"  # ours: likelihood weighs fits and agreement by how much was seen, in nats
     independent_s: float = 0.5  # ours, of likelihood: errors this far apart count as independent
+    slope_spread: float | None = (
+        None  # ours, of likelihood: of right pairs' log slopes, in place of the z-score's pruning
+    )
+    named_nats: float = (
+        0.0  # ours, with slope_spread: log odds that a trace is a tagged thing's; above 8 all are taken for
+    )
     programme: bool = True  # False ends with the Hungarian matching of V.A
     spread: Spread = "std"  # ours: mad
     least_spread: float = 0.5  # ours: of the shared coefficient, as a share of it; short traces scatter so much
@@ -63,6 +70,10 @@ class MatchSettings:
             raise ValueError(
                 f"threshold {self.threshold}, mu {self.mu}, least_spread {self.least_spread}, time_limit_s "
                 f"{self.time_limit_s}; expected positive ones (mu and least_spread: not negative)."
+            )
+        if self.slope_spread is not None and not (self.slope_spread > 0 and self.weigh == "likelihood"):
+            raise ValueError(
+                f"slope_spread is {self.slope_spread} with weigh {self.weigh}; expected a positive spread, of likelihood."
             )
         if self.least_samples < 3:
             raise ValueError(f"least_samples is {self.least_samples}; two points always lie on a line: at least 3.")
@@ -133,13 +144,18 @@ def identify(
     kept = keep_edges(slope, shared, settings.threshold) & (weight > 0) & (r_squared >= settings.least_r_squared)
     selection, tag_of = None, matched
     if settings.programme:
-        trace, tag = np.nonzero(kept)
-        quadratic, worth, together = np.zeros((len(trace), len(trace))), weight, None
+        worth, together = weight, None
         if settings.weigh == "likelihood":
             apart = settings.independent_s / traces.step_s()  # frames
-            worth = likelihood_weight(weight, np.asarray(fit.count, np.float64) / apart)
+            count = np.asarray(fit.count, np.float64)
+            worth = likelihood_weight(weight, count / apart)
             seen = traces.seen.astype(np.float64)
             together = seen @ seen.T / apart
+            if settings.slope_spread is not None and shared is not None:
+                worth = worth + slope_log_odds(slope, shared, settings.slope_spread) + settings.named_nats
+                kept = (count >= settings.least_samples) & (worth > 0) & (r_squared >= settings.least_r_squared)
+        trace, tag = np.nonzero(kept)
+        quadratic = np.zeros((len(trace), len(trace)))
         if settings.mu > 0 and len(trace):
             _, agreed = _fits(traces, heard.sequences, focal_px, foot, with_agreement=True)
             quadratic = settings.mu * edge_agreement(np.asarray(agreed), trace, tag, together)
