@@ -17,17 +17,14 @@ from tagjax.attention import coherent_score
 from tagjax.config import from_mapping
 from tagjax.evaluation.real_tags import (
     SCORES,
-    Speeds,
-    Walk,
     align,
     associate,
     heard_speed,
-    load_tagged,
-    load_uwb,
     places_around,
     speed_scores,
     speed_windows,
 )
+from tagjax.evaluation.tagged_walks import Speeds, Walk, load_tagged, load_uwb
 from tagjax.evaluation.tracks import (
     METHODS,
     Scene,

@@ -26,6 +26,7 @@ from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
 from tagjax.training.loop import DivergedError, LoopSettings, resumed, train
 from tagjax.training.loss import (
+    TERM_NAMES,
     TERMS,
     ObjectiveSettings,
     agreement,
@@ -49,6 +50,12 @@ KEY = jax.random.PRNGKey(0)
 
 def _clip(length: int = 20) -> synthetic.SyntheticClip:
     return synthetic.load(synthetic.recording(40), 5, 5 + length)
+
+
+def test_every_term_has_a_weight_and_every_weight_a_term() -> None:
+    assert set(TERM_NAMES) == set(TERMS)
+    names = set(TERM_NAMES) & {field.name for field in dataclasses.fields(ObjectiveSettings)}
+    assert names == set(TERM_NAMES)
 
 
 def test_clip_reads_hold_each_read_once() -> None:

@@ -26,8 +26,9 @@ from ..rf.windows import phase_reads, radio_windows
 from ..sim.reader import ReaderSettings
 from ..sim.virtual_tag import Track, virtual_reads
 from ..viz.tracks import accuracy_plot, speeds_plot
-from .real_tags import SCORES, associate, load_tagged, load_uwb, read_kinect, read_xovis, speed_scores, speed_windows
+from .real_tags import SCORES, associate, speed_scores, speed_windows
 from .report import write_json
+from .tagged_walks import load_tagged, load_uwb, read_kinect, read_xovis
 
 METHODS = (
     "TagAttention, coherent",

@@ -15,7 +15,7 @@ from ..propagation import log_likelihood_ratio, radio_speed, velocity_gate
 from ..rf.reads import PhaseReads, RadioWindow
 from ..segmentation import unpool
 from ..view import Ranging, View, of_each_antenna
-from ._parameters import AbstractTagAttention
+from ._fields import AbstractTagAttention
 
 
 class AbstractEvidence(AbstractTagAttention):

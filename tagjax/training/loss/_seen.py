@@ -1,0 +1,131 @@
+"""What the objective looks at: its settings, and a clip with what the tracer made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from ...rf.reads import PhaseReads
+from ...tracer import AbstractTracer, Camera, Frame, Trace, trace
+
+TERM_NAMES = ("contrast", "coverage", "area", "compactness", "steadiness", "calibration")
+"""The terms of the objective, each with its weight among the settings."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectiveSettings:
+    """Weights of the terms and what they look at. Terms of weight 0 are not computed."""
+
+    contrast: float = 1.0
+    coverage: float = 0.3
+    area: float = 0.0  # weak priors, which know nothing of the tag: of the mask's share of the picture,
+    compactness: float = 0.0  # of its spread in 3D, m^2,
+    steadiness: float = 0.0  # and of what changes of it along the flow
+    calibration: float = 0.0  # of the confidence: how often a mask's motion does explain the reads best
+    evidence: Literal["coherence", "likelihood"] = "coherence"  # of the contrast
+    temperature: float = 0.1  # of the contrast, in units of coherence; of the likelihood in nats
+    flip_share: float = 0.05  # of the likelihood: reads that are off by pi
+    num_shifts: int = 4  # time-shifted copies of the own motion among the negatives
+    span_frames: int = 6  # coherence is taken over pieces this long: drift of the sum does not reach further
+    skip_frames: int = 12  # at the start of a clip, while the tracer has not seen enough
+    min_reads: int = 6  # a piece with fewer reads says nothing
+    rest_margin: float = (
+        0.05  # a piece whose reads, modulo pi, lose less coherence than this by taking the tag to rest is left out
+    )
+    max_reads: int = 384  # reads of one tag in a clip
+    num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
+    multiple: int = 1  # of the coherence: 2 takes phases modulo pi: right whether the reader flips or not, but ambiguous twice as soon
+    future_alpha_m2: float = 1e-3  # a pixel agrees with the future if it is within about the root of this
+    future_stride: int = 2  # every n-th working pixel is asked
+    rematerialise: bool = True  # keep only the tracer's states for the backward pass
+    memory: float = 0.5  # share of the gradient that a frame hands on to the frame before
+
+    def __post_init__(self) -> None:
+        if not 0 < self.flip_share < 1:
+            raise ValueError(f"flip_share is {self.flip_share}; expected a share between 0 and 1, both left out.")
+
+    def weights(self) -> dict[str, float]:
+        """The weight of each term that takes part, by name."""
+        weights = {name: float(getattr(self, name)) for name in TERM_NAMES}
+        taking_part = {name: weight for name, weight in weights.items() if weight != 0.0}
+        if not taking_part:
+            raise ValueError(f"All terms of the objective have weight 0; give one of {', '.join(TERM_NAMES)} a weight.")
+        return taking_part
+
+
+class Seen(eqx.Module):
+    """A clip with what the tracer made of it."""
+
+    camera: Camera
+    frames: Frame
+    said: Trace
+    reads: PhaseReads  # (tag, antenna, reads): each read of the clip once
+
+
+class _Trained(AbstractTracer):
+    """A tracer as the backward pass sees it: steps computed again rather than kept, gradients fading into the past.
+
+    A recurrent tracer multiplies gradients from frame to frame; without fading, those of the first frames drown all
+    others. Values are unchanged.
+    """
+
+    tracer: AbstractTracer
+    memory: float = eqx.field(static=True)
+    rematerialise: bool = eqx.field(static=True)
+
+    def init(self, camera: Camera, frame: Frame) -> Any:
+        return self.tracer.init(camera, frame)
+
+    def step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
+        state = jax.tree.map(self._fade, state)
+        if not self.rematerialise:
+            return self.tracer.step(camera, state, frame)
+        return eqx.filter_checkpoint(lambda t, c, s, f: t.step(c, s, f))(self.tracer, camera, state, frame)
+
+    def _fade(self, leaf: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            return leaf
+        return self.memory * leaf + jax.lax.stop_gradient((1.0 - self.memory) * leaf)
+
+    def finish(self, state: Any) -> Any:
+        return self.tracer.finish(state)
+
+
+def see(tracer: AbstractTracer, camera: Camera, frames: Frame, settings: ObjectiveSettings) -> Seen:
+    """Run the tracer over a clip (leading time axis)."""
+    wrapped = _Trained(tracer, settings.memory, settings.rematerialise)
+    return Seen(camera, frames, trace(wrapped, camera, frames), clip_reads(frames, settings))
+
+
+def clip_reads(frames: Frame, settings: ObjectiveSettings) -> PhaseReads:
+    """Each tag's reads of the whole clip by each antenna, (tag, antenna, reads), from the overlapping windows of its frames.
+
+    Of a frame's window only what came after the frame before is new. Channels are numbered anew by first appearance
+    and cut at `num_channels`; of more than `max_reads` reads the newest stay.
+    """
+    before = jnp.concatenate([frames.time_s[:1], frames.time_s[:-1]])[:, None, None, None]
+    reads = frames.reads
+    new = reads.valid & (reads.time_s > before) & (reads.time_s <= frames.time_s[:, None, None, None])
+    reads = eqx.tree_at(lambda r: r.valid, reads, new)
+
+    def pack(one: PhaseReads) -> PhaseReads:
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1), one)
+        order = jnp.argsort(flat.valid, stable=True)[-settings.max_reads :]
+        packed = jax.tree.map(lambda leaf: leaf[order], flat)
+        number = _number_channels(packed.channel, packed.valid)
+        keep = packed.valid & (number < settings.num_channels)
+        return eqx.tree_at(lambda r: (r.channel, r.valid), packed, (jnp.where(keep, number, 0), keep))
+
+    return jax.vmap(jax.vmap(pack))(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 2), reads))
+
+
+def _number_channels(channel: Int[Array, " reads"], valid: Bool[Array, " reads"]) -> Int[Array, " reads"]:
+    """Channels renumbered 0, 1, 2, ... in order of first appearance among the valid reads."""
+    first = jnp.argmax((channel[:, None] == channel[None, :]) & valid[None, :], axis=1)
+    leads = valid & (first == jnp.arange(channel.shape[0], dtype=first.dtype))
+    return (jnp.cumsum(leads.astype(jnp.int32)) - 1)[first]
