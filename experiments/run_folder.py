@@ -21,26 +21,26 @@ _FREE = (
     "matmul_precision",
 )
 _FREE_ENDS = ("workers", "decay_steps")  # the latter follows loop.num_steps
-_RETUNED = ("clip_norm", "optimizer", "joint.optimizer")
+_RETUNED = ("clip_norm", "optimizer", "joint.clip_norm", "joint.optimizer")
 
 
 def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
     """Write `config.yaml`, where the run is new or goes on as it was configured.
 
-    Length, logs, scores and processes may change when a run goes on, with `retune` the optimiser as well. Raises `ValueError`, naming what differs, where
-    anything else does, and leaves the file as it was; also where the run may not go on, which the run itself refuses.
+    Length, logs, scores and processes may change when a run goes on, with `retune` the optimiser's numbers as well (not its
+    kind, whose state would have another shape). Raises `ValueError`, naming what differs, where anything else does, and
+    leaves the file as it was; also where the run may not go on, which the run itself refuses.
     """
     path = folder / "config.yaml"
     if checkpoint_steps(folder) and path.is_file():
         if not values.get("resume", True):
             return
         before = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-        retuned = values.get("retune", False)
-        differ = _differences(before, dict(values), free=(*_FREE, *_RETUNED) if retuned else _FREE)
+        differ = _differences(before, dict(values), retune=bool(values.get("retune", False)))
         if differ:
             raise ValueError(
                 f"{folder} holds a run that was configured otherwise: {'; '.join(differ)}. Give the same settings to go on "
-                "with it (retune=true lets the optimiser and clip_norm change), or another folder."
+                "with it (retune=true lets clip_norm and numbers of the optimiser change), or another folder."
             )
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     OmegaConf.save(OmegaConf.create(dict(values)), beside)
@@ -52,14 +52,17 @@ def checkpoint_steps(folder: Path) -> list[int]:
     return [int(path.name) for path in (folder / "checkpoints").glob("*") if path.name.isdigit()]
 
 
-def _differences(before: Any, now: Any, where: str = "", *, free: tuple[str, ...]) -> list[str]:
-    if where in free or where.rpartition(".")[2] in _FREE_ENDS:
+def _differences(before: Any, now: Any, where: str = "", *, retune: bool) -> list[str]:
+    if where in _FREE or where.rpartition(".")[2] in _FREE_ENDS:
+        return []
+    retuned = retune and any(where == name or where.startswith(f"{name}.") for name in _RETUNED)
+    if retuned and all(isinstance(value, int | float) for value in (before, now)):
         return []
     if isinstance(before, dict) and isinstance(now, dict):
         names = [*now, *(name for name in before if name not in now)]
         return [
             text
             for name in names
-            for text in _differences(before.get(name), now.get(name), f"{where}.{name}".lstrip("."), free=free)
+            for text in _differences(before.get(name), now.get(name), f"{where}.{name}".lstrip("."), retune=retune)
         ]
     return [] if before == now else [f"{where} was {before!r} and is {now!r}"]

@@ -62,7 +62,7 @@ class Trace(eqx.Module):
     """What a tracer says of every tag at one frame; `trace` stacks it over time."""
 
     mask: Float[Array, "*time tag height width"]  # soft mask, 0 to 1
-    box_px: Float[Array, "*time tag 4"]  # x0 y0 x1 y1, inclusive pixel edges at the working resolution
+    box_px: Float[Array, "*time tag 4"]  # x0 y0 x1 y1, first and last pixel, at the working resolution
     centre_px: Float[Array, "*time tag 2"]  # x y of the mask's centroid
     centre_m: Float[Array, "*time tag 3"]  # camera frame
     step_m: Float[Array, "*time tag antenna"]  # change of the object's distance to each antenna since the last frame

@@ -16,6 +16,7 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
 from experiments.compare import suites_named
+from tagjax.baselines.tagview import MatchSettings
 from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
 from tagjax.evaluation.compare import SystemSettings
 from tagjax.evaluation.evaluate import ScoreSettings
@@ -111,6 +112,9 @@ def test_the_comparison_takes_each_system_as_its_own_experiments_do() -> None:
     # What is claimed on the way is one of the settings that are compared on the same tracks.
     assert vision["matching"]["adapted"] == vision["system"]["match"]
     assert view["matching"][view["whole"]] == {name: view["system"][name] for name in ("reads", "match")}
+    whole = from_mapping(MatchSettings, view["system"]["match"])
+    for name, change in (("no_rssi", {"mu": 0.0}), ("camera_origin", {"origin": "principal"})):
+        assert from_mapping(MatchSettings, view["matching"][name]["match"]) == dataclasses.replace(whole, **change)
     for name, tracer in (("people", "tagattention"), ("handheld", "tagattention_handheld")):
         assert systems["tagattention"][name]["tracer"] == _compose("train", f"tracer={tracer}")["tracer"]
 

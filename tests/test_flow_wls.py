@@ -48,7 +48,7 @@ def test_a_wrong_spot_that_agrees_with_itself_is_outvoted() -> None:
 def test_its_gradient_is_the_difference_quotient_and_finite_where_nothing_agrees(gradients_agree) -> None:
     random = np.random.default_rng(0)
     flow, confidence = random.normal(size=(4, 5, 2)), random.uniform(0.2, 1.0, size=(4, 5))
-    picture = 0.02 * random.uniform(size=(4, 5, 3))  # bonds neither whole nor gone
+    picture = 0.02 * random.uniform(size=(4, 5, 3))  # affinities neither whole nor gone
     gradients_agree(weighted_least_squares, (flow, confidence, picture), atol=1e-5)
     gradients = jax.grad(lambda *arguments: jnp.sum(weighted_least_squares(*arguments)), argnums=(0, 1, 2))(
         jnp.zeros((4, 5, 2)), jnp.zeros((4, 5)), jnp.zeros((4, 5, 3))
@@ -66,7 +66,8 @@ def pair():
 def test_a_named_flow_is_smoothed_both_ways_alone_along_a_video_and_with_what_is_hidden(pair) -> None:
     (first, second), truth, hidden = pair
     plain, smoothed = make_flow("dis"), make_flow("dis+wls")
-    ((ahead, back),) = flow_along(smoothed, iter([first, second]))
+    (ahead, back), (again, _) = flow_along(smoothed, iter([first, second, first]))
+    np.testing.assert_array_equal(again, back)
     np.testing.assert_array_equal(ahead, smoothed(first, second))
     np.testing.assert_array_equal(back, smoothed(second, first))
     found = estimate(smoothed, first, second)

@@ -20,9 +20,11 @@ from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, VirtualTagSe
 from tagjax.data.store import save_recording
 from tagjax.evaluation.run import run_evaluation
 from tagjax.recording import RecordingError, TagReads
+from tagjax.tagattention import TagAttention
+from tagjax.tagattention_paper import TagAttentionPaper
 from tagjax.training import run as run_module
 from tagjax.training.loop import Trained
-from tagjax.training.run import make_tracer, run_training
+from tagjax.training.run import antennas_for, make_tracer, run_training
 from tagjax.training.sources import join_reads, with_virtual_tags
 from tagjax.training.state import TrainState
 
@@ -240,3 +242,9 @@ def test_reads_of_unlike_conventions_are_not_joined() -> None:
     assert (both.time_ns[1:] >= both.time_ns[:-1]).all()
     with pytest.raises(RecordingError, match="convert first"):
         join_reads([one, dataclasses.replace(TagReads.empty(), phase_sign=-1)])
+
+
+def test_a_tracer_of_one_antenna_gets_the_named_one_and_of_several_the_busiest() -> None:
+    one, several = TagAttentionPaper(), TagAttention()
+    assert [antennas_for(one, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), None, None]
+    assert [antennas_for(several, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), (1, 2), "all"]

@@ -37,10 +37,27 @@ def test_another_configuration_is_refused_by_name_and_changes_nothing(tmp_path: 
 
 
 def test_the_optimiser_changes_only_where_that_is_asked_for(tmp_path: Path) -> None:
-    slower = {**VALUES, "optimizer": {"decay_steps": 4, "learning_rate": 0.001}, "clip_norm": 0.1}
+    begun = {
+        **VALUES,
+        "optimizer": {"_target_": "optax.adam", "learning_rate": 0.01},
+        "clip_norm": 1,
+        "joint": {"clip_norm": 1.0},
+    }
+    slower = {**begun, "optimizer": {"_target_": "optax.adam", "learning_rate": 0.001}, "clip_norm": 0.1}
     folder = _begun(tmp_path)
-    with pytest.raises(ValueError, match=r"clip_norm was None and is 0\.1.*retune=true lets"):
+    OmegaConf.save(OmegaConf.create(begun), folder / "config.yaml")
+    with pytest.raises(ValueError, match=r"clip_norm was 1 and is 0\.1.*retune=true lets"):
         keep_configuration(folder, slower)
+    # Another kind of optimiser, or a schedule for a number, would have another state than the checkpoints hold.
+    schedule = {"_target_": "optax.adam", "learning_rate": {"_target_": "optax.cosine_decay_schedule"}}
+    for kind, told in (
+        ({"_target_": "optax.sgd", "learning_rate": 0.01}, r"optax\.adam"),
+        (schedule, r"learning_rate was 0\.01"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            keep_configuration(folder, {**slower, "retune": True, "optimizer": kind})
+    assert OmegaConf.load(tmp_path / "config.yaml") == begun
+    slower["joint"] = {"clip_norm": 0.5}
     with pytest.raises(ValueError, match="seed was 0 and is 3"):
         keep_configuration(folder, {**slower, "retune": True, "seed": 3})
     keep_configuration(folder, {**slower, "retune": True})

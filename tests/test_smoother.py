@@ -25,9 +25,9 @@ def _drawn(height: int, width: int, seed: int = 0) -> tuple[jax.Array, jax.Array
 def test_one_row_in_one_round_is_the_weighted_least_squares_of_it() -> None:
     """Along a row it is exact: (W + 1.5 l A) u = W f has another diagonal, so numerator and denominator are solved apart."""
     values, weights, guide = (np.asarray(array, np.float64) for array in _drawn(1, 30))
-    bond = 0.5 * STRENGTH * np.exp(-np.abs(np.diff(guide[0], axis=0)).mean(axis=-1) / EDGE)
+    affinity = 0.5 * STRENGTH * np.exp(-np.abs(np.diff(guide[0], axis=0)).mean(axis=-1) / EDGE)
     laplacian = np.zeros((30, 30))
-    for k, b in enumerate(bond):
+    for k, b in enumerate(affinity):
         laplacian[k : k + 2, k : k + 2] += b * np.asarray([[1, -1], [-1, 1]])
     inverse = np.linalg.inv(np.eye(30) + laplacian)
     expected = inverse @ (weights[0, :, None] * values[0]) / (inverse @ weights[0])[:, None]
@@ -41,9 +41,9 @@ def test_a_picture_is_rows_and_columns_in_turn_with_less_strength_each_round(hei
     lines = np.concatenate([weights[..., None] * values, weights[..., None]], axis=-1)
     for strength in (0.4 * STRENGTH, 0.1 * STRENGTH):  # 1.5 (4, 1) / (4^2 - 1)
         for _ in range(2):
-            bond = strength * np.exp(-np.abs(np.diff(guide, axis=1)).mean(axis=-1) / EDGE)
-            none = np.zeros((len(bond), 1))
-            before, after = np.concatenate([none, bond], axis=1), np.concatenate([bond, none], axis=1)
+            affinity = strength * np.exp(-np.abs(np.diff(guide, axis=1)).mean(axis=-1) / EDGE)
+            none = np.zeros((len(affinity), 1))
+            before, after = np.concatenate([none, affinity], axis=1), np.concatenate([affinity, none], axis=1)
             for row in range(len(lines)):
                 bands = np.stack([np.roll(-after[row], 1), 1 + before[row] + after[row], np.roll(-before[row], -1)])
                 lines[row] = solve_banded((1, 1), bands, lines[row])
@@ -74,6 +74,18 @@ def test_what_has_no_weight_is_filled_from_its_own_side_of_an_edge() -> None:
     values, weights = jnp.where(hole[..., None], 99.0, truth), jnp.asarray(~hole, jnp.float32)
     found = fast_global_smooth(values, weights, guide, strength=200.0, edge=0.01)
     np.testing.assert_allclose(found, truth, atol=1e-3)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.3, 1.0])
+def test_what_no_weight_reaches_keeps_what_it_has(step: float) -> None:
+    """Behind an edge that lets nothing through, and where nothing weighs at all."""
+    inside = np.zeros((10, 14), bool)
+    inside[3:7, 8:] = True
+    guide = jnp.asarray(step * np.broadcast_to(inside[..., None], (10, 14, 3)), jnp.float32)
+    values = jnp.full((10, 14, 2), -12.0)
+    for weights in (~inside, np.zeros_like(inside)):
+        found = fast_global_smooth(values, jnp.asarray(weights, jnp.float32), guide, strength=200.0, edge=0.01)
+        np.testing.assert_allclose(found, values, rtol=1e-5)
 
 
 def test_where_nothing_weighs_it_is_finite_and_so_is_its_gradient() -> None:

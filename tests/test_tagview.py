@@ -33,6 +33,7 @@ from tagjax.baselines.tagview import (
     pieces,
     select_edges,
     shared_coefficient,
+    shared_times,
     slope_log_odds,
     splice_phase,
     translating_factor,
@@ -375,10 +376,30 @@ def test_edges_have_no_agreement_with_themselves():
 def test_agreement_counts_from_even_odds_where_it_is_weighed_by_time():
     table = np.random.default_rng(0).uniform(size=(2, 2, 2, 2))
     trace, tag = np.array([0, 1, 1]), np.array([0, 0, 1])
-    quadratic = edge_agreement(table, trace, tag, np.array([[9.0, 4.0], [4.0, 7.0]]))
-    assert quadratic[0, 2] == pytest.approx(4.0 * (table[0, 1, 0, 1] - 0.5))
+    together = np.random.default_rng(1).uniform(1, 9, size=(2, 2, 2, 2))
+    quadratic = edge_agreement(table, trace, tag, together)
+    assert quadratic[0, 2] == pytest.approx(together[0, 1, 0, 1] * (table[0, 1, 0, 1] - 0.5))
     np.testing.assert_array_equal(np.diag(quadratic), 0.0)
-    assert not np.any(edge_agreement(np.full((2, 2, 2, 2), 0.5), trace, tag, np.ones((2, 2))))
+    assert not np.any(edge_agreement(np.full((2, 2, 2, 2), 0.5), trace, tag, together))
+
+
+def test_times_count_at_which_both_traces_are_seen_and_both_strengths_known():
+    seen, heard = np.random.default_rng(0).random((3, 40)) < 0.7, np.random.default_rng(1).random((2, 40)) < 0.5
+    found = np.asarray(shared_times(jnp.asarray(heard), jnp.asarray(seen)))
+    for one, other, i, j in itertools.product(range(3), range(3), range(2), range(2)):
+        assert found[one, other, i, j] == np.sum(seen[one] & seen[other] & heard[i] & heard[j])
+
+
+def test_of_likelihood_a_short_trace_has_little_say_in_the_shared_slope():
+    slope, weight = np.array([[2.0], [6.0]]), np.array([[30.0], [1.0]])
+    tag_of = np.array([0, 0])
+    plain = shared_coefficient(slope, tag_of, spread="std", least_share=0.0)
+    weighed = shared_coefficient(slope, tag_of, spread="std", least_share=0.0, weight=weight)
+    assert plain is not None
+    assert weighed is not None
+    assert (plain.mean, plain.spread) == (4.0, 2.0)
+    assert weighed.mean == pytest.approx(66 / 31)
+    assert weighed.spread == pytest.approx(np.sqrt((30 * (2 - 66 / 31) ** 2 + (6 - 66 / 31) ** 2) / 31))
 
 
 def test_a_line_weighs_its_likelihood_ratio():
@@ -478,6 +499,10 @@ def test_settings_are_checked():
         MatchSettings(independent_s=0.0)
     with pytest.raises(ValueError, match=r"slope_spread is 0\.2 with weigh r_squared"):
         MatchSettings(slope_spread=0.2)
+    with pytest.raises(ValueError, match=r"named_nats is 2\.0 without slope_spread"):
+        MatchSettings(weigh="likelihood", named_nats=2.0)
+    with pytest.raises(ValueError, match="without the programme"):
+        MatchSettings(weigh="likelihood", programme=False)
     with pytest.raises(ValueError, match="slope_spread is 0"):
         MatchSettings(weigh="likelihood", slope_spread=0.0)
 

@@ -52,10 +52,8 @@ def _clip(length: int = 20) -> synthetic.SyntheticClip:
     return synthetic.load(synthetic.recording(40), 5, 5 + length)
 
 
-def test_every_term_has_a_weight_and_every_weight_a_term() -> None:
-    assert set(TERM_NAMES) == set(TERMS)
-    names = set(TERM_NAMES) & {field.name for field in dataclasses.fields(ObjectiveSettings)}
-    assert names == set(TERM_NAMES)
+def test_every_term_has_a_weight() -> None:
+    assert set(TERM_NAMES) == set(TERMS) <= {field.name for field in dataclasses.fields(ObjectiveSettings)}
 
 
 def test_clip_reads_hold_each_read_once() -> None:

@@ -63,8 +63,8 @@ def check_clip(*, stride: int = 1, window: int = 2, max_reads: int = 1) -> None:
 def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antennas = None) -> tuple[int, ...]:
     """The antennas (counted from 1) that distances are to: the given ones, all, or the one with the most reads (None).
 
-    All are those that `antennas_m` places and that have read one of the tags (given ones: any tag); with None, reads of known carrier count
-    before others, and of equals the first antenna. Warns (`RecordingWarning`) of the reads that are of no use then.
+    All are those that `antennas_m` places and that have read one of the tags; given ones need have read any tag. With None,
+    reads of known carrier count before others, and of equals the first antenna. Warns (`RecordingWarning`) of the reads that are of no use then.
     Raises `RecordingError` where no antenna is left.
     """
     reads = recording.reads[np.isin(recording.reads.epc, list(epcs))]
@@ -86,7 +86,8 @@ def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antenna
         if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= heard:
             raise RecordingError(
                 f"{recording.name}: antennas {', '.join(map(str, chosen)) or 'none'} asked for; antennas_m places antennas 1 to "
-                f"{num_placed}, and the tags' reads are: {made}. Choose antennas that have both, each once."
+                f"{num_placed}, of which {', '.join(map(str, sorted(heard))) or 'none'} made reads (of the tags asked for: {made}). "
+                "Choose antennas that have both, each once."
             )
     used = np.isin(reads.antenna, chosen)
     if not used.all():

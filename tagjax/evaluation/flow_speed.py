@@ -56,7 +56,7 @@ def _step(seed: int) -> Callable[[], Any]:
 
 
 def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timing]:
-    """One way and both ways beside DIS, the fast and the fine pyramid, along a video, and a step of training.
+    """One way and both ways beside DIS, the fast and the fine pyramid, smoothed ones, along a video, and a step of training.
 
     The fast and the fine pyramid come as packaged; the weights of the others are untrained.
 
@@ -67,7 +67,7 @@ def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timin
     first, second = pictures[:2]
     network = NetworkFlow(PyramidFlow(seed=seed))
     compile_s = first_call_s(lambda: network(first, second))
-    packaged = {name: make_flow(name) for name in ("pyramid_fast", "pyramid_fine")}
+    packaged = {name: make_flow(name) for name in ("pyramid_fast", "pyramid_fine", "pyramid_fine+wls", "dis+wls")}
     packaged_compile_s = {name: first_call_s(lambda flow=flow: flow(first, second)) for name, flow in packaged.items()}
     calls: dict[str, Callable[[], Any]] = {"pyramid": lambda: network(first, second)}
     calls |= {name: lambda flow=flow: flow(first, second) for name, flow in packaged.items()}
@@ -85,6 +85,11 @@ def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timin
     timings += [
         Timing(f"pyramid, {size}, one way", taken["pyramid"], *dis, compile_s, memory["forward"]),
         Timing(f"pyramid_fine, {size}, one way", taken["pyramid_fine"], *dis, packaged_compile_s["pyramid_fine"]),
+    ]
+    # Smoothing asks a flow for both of its ways.
+    timings += [
+        Timing(f"{name}, {size}, one way", taken[name], *dis, packaged_compile_s[name])
+        for name in ("pyramid_fine+wls", "dis+wls")
     ]
     both = taken["pyramid along"] / pairs, "DIS medium, both ways", taken["dis along"] / pairs
     timings.append(Timing(f"pyramid, {size}, both ways, a frame of a video", *both))

@@ -16,7 +16,7 @@ STRENGTH = 200.0
 """Smoothing without an edge reaches some sqrt(STRENGTH) pixels."""
 
 EDGE = 0.01
-"""Difference of neighbours, of colours from 0 to 1, that weakens their bond to 1/e."""
+"""Difference of neighbours, of colours from 0 to 1, that weakens their affinity to 1/e."""
 
 ROUNDS = 2
 """The second weighs anew, so that a wrong flow which leads back to its start does not pull its surroundings along."""

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from ..config import ClipSettings, ConfigError, TrainConfig, build
-from ..data.clips import Clip, clip_dataset
+from ..data.clips import Antennas, Clip, clip_dataset
 from ..evaluation.evaluate import RecordingResult, ScoreSettings, evaluate_recording
 from ..evaluation.report import plain, score_table, write_json, write_report
 from ..learned import load_parameters, save_parameters
@@ -257,6 +257,12 @@ def smoothed(tracers: Mapping[str, AbstractTracer], settings: ScoreSettings) -> 
     return names
 
 
+def antennas_for(tracer: AbstractTracer, antennas: Antennas) -> Antennas:
+    """The antennas that a tracer is given: the busiest one (None) where it knows one only and several are asked for."""
+    several = antennas == "all" or (antennas is not None and len(antennas) > 1)
+    return None if tracer.one_antenna and several else antennas
+
+
 def evaluate_tracers(
     tracers: Mapping[str, AbstractTracer],
     recordings: Sequence[Recording],
@@ -273,7 +279,7 @@ def evaluate_tracers(
     """Run each tracer over each recording, write the report into `folder` and return its summary.
 
     `estimators` and `flows` name the radio estimator and the flow of tracers that do not take the clips' own; a tracer that
-    knows one antenna gets the busiest one, whatever the clips say. With
+    knows one antenna gets the busiest one where the clips take several. With
     `settings.smooth` those that can smooth do, which their names tell; the others go forwards only. Raises `ConfigError`
     where none can.
     """
@@ -284,7 +290,7 @@ def evaluate_tracers(
                 clips,
                 estimator=estimators.get(name, clips.estimator),
                 flow=flows.get(name, clips.flow),
-                antennas=None if tracer.one_antenna else clips.antennas,
+                antennas=antennas_for(tracer, clips.antennas),
             )
         )
         for name, tracer in tracers.items()

@@ -1,6 +1,7 @@
 """Tagview (Duan et al., INFOCOM 2020): camera and antenna at the ceiling, phase linear in the translating factor."""
 
 from ._agreement import agreement as agreement
+from ._agreement import shared_times as shared_times
 from ._boxes import from_inclusive as from_inclusive
 from ._boxes import middle_px as middle_px
 from ._boxes import overlap as overlap

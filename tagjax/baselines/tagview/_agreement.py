@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 
@@ -30,13 +31,23 @@ def agreement(
     for the sign: it then has gradients, and its limit is the sign. On undistorted pictures S orders as the distance.
     """
     stronger, farther = _order(rssi_dbm, rssi_width_db), _order(distance_px, distance_width_px)
-    both_heard = (heard[:, None] & heard[None, :]).astype(rssi_dbm.dtype)
-    both_seen = (seen[:, None] & seen[None, :]).astype(rssi_dbm.dtype)
+    both_heard, both_seen = (_together(known, rssi_dbm.dtype) for known in (heard, seen))
     product = jnp.einsum(
         "klt,ijt->klij", farther * both_seen, stronger * both_heard, precision=jax.lax.Precision.HIGHEST
     )
-    count = jnp.einsum("klt,ijt->klij", both_seen, both_heard, precision=jax.lax.Precision.HIGHEST)
-    return 0.5 - 0.5 * product / jnp.maximum(count, 1.0)
+    return 0.5 - 0.5 * product / jnp.maximum(shared_times(heard, seen), 1.0)
+
+
+def shared_times(
+    heard: Bool[Array, "tags time"], seen: Bool[Array, "traces time"]
+) -> Float[Array, "traces traces tags tags"]:
+    """[k, l, i, j]: at how many times traces k and l are seen and the strengths of tags i and j are known."""
+    both_heard, both_seen = (_together(known, float) for known in (heard, seen))
+    return jnp.einsum("klt,ijt->klij", both_seen, both_heard, precision=jax.lax.Precision.HIGHEST)
+
+
+def _together(known: Bool[Array, "rows time"], dtype: DTypeLike) -> Float[Array, "rows rows time"]:
+    return (known[:, None] & known[None, :]).astype(dtype)
 
 
 def _order(value: Float[Array, "rows time"], width: float) -> Float[Array, "rows rows time"]:

@@ -49,8 +49,9 @@ def shared_coefficient(
     *,
     spread: Spread,
     least_share: float,
+    weight: Float[np.ndarray, "traces tags"] | None = None,
 ) -> Coefficient | None:
-    """Mean and standard deviation of the matched pairs' slopes (V.B); None where nothing is matched.
+    """Mean and standard deviation of the matched pairs' slopes (V.B), weighed if asked for; None where nothing is matched.
 
     `mad` takes the median and 1.48 times the median distance from it, which single wrong matches do not move. The
     spread is at least `least_share` of the mean: two slopes that happen to agree would cut off everything else.
@@ -60,7 +61,9 @@ def shared_coefficient(
         return None
     values = np.asarray(slope, np.float64)[rows, tag_of[rows]]
     if spread == "std":
-        middle, width = float(values.mean()), float(values.std())
+        share = None if weight is None else weight[rows, tag_of[rows]]
+        middle = float(np.average(values, weights=share))
+        width = float(np.sqrt(np.average(np.square(values - middle), weights=share)))
     else:
         middle = float(np.median(values))
         width = 1.4826 * float(np.median(np.abs(values - middle)))
@@ -120,14 +123,16 @@ def edge_agreement(
     agreement: Float[np.ndarray, "traces traces tags tags"],
     trace: Int[np.ndarray, " edges"],
     tag: Int[np.ndarray, " edges"],
-    together: Float[np.ndarray, "traces traces"] | None = None,
+    together: Float[np.ndarray, "traces traces tags tags"] | None = None,
 ) -> Float[np.ndarray, "edges edges"]:
     """Q of Eq. 10: the agreement of every two edges; 0 of an edge with itself, which says nothing.
 
-    With `together`, how often two traces were seen at once, it is what agreement is above or below even odds, so many times.
+    With `together`, how often two traces were seen and two tags' strengths known at once, it is what agreement is above or
+    below even odds, so many times.
     """
-    quadratic = np.asarray(agreement, np.float64)[trace[:, None], trace[None, :], tag[:, None], tag[None, :]].copy()
+    edges = trace[:, None], trace[None, :], tag[:, None], tag[None, :]
+    quadratic = np.asarray(agreement, np.float64)[edges].copy()
     if together is not None:
-        quadratic = (quadratic - 0.5) * together[trace[:, None], trace[None, :]]
+        quadratic = (quadratic - 0.5) * together[edges]
     np.fill_diagonal(quadratic, 0.0)
     return quadratic

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from ._agreement import agreement
+from ._agreement import agreement, shared_times
 from ._fit import LineFit, fit_pairs, translating_factor
 from ._graph import (
     Coefficient,
@@ -50,7 +50,7 @@ class MatchSettings:
     programme: bool = True  # False ends with the Hungarian matching of V.A
     spread: Spread = "std"  # ours: mad
     least_spread: float = 0.5  # ours: of the shared coefficient, as a share of it; short traces scatter so much
-    positive: bool = True  # ours: phases grow with distance, so a falling line is no fit
+    positive: bool = True  # ours: phases grow with distance, so a falling line is no fit (R^2 0)
     least_r_squared: float = 0.0  # ours: an edge below is pruned, so that a thing without a tag stays unnamed
     least_samples: int = 8  # ours: a pair that shares fewer has weight 0
     overlap_s: float = 0.2  # ours: two traces of one tag may overlap by so much
@@ -74,6 +74,12 @@ class MatchSettings:
         if self.slope_spread is not None and not (self.slope_spread > 0 and self.weigh == "likelihood"):
             raise ValueError(
                 f"slope_spread is {self.slope_spread} with weigh {self.weigh}; expected a positive spread, of likelihood."
+            )
+        if self.named_nats and self.slope_spread is None:
+            raise ValueError(f"named_nats is {self.named_nats} without slope_spread, of which it is a part.")
+        if self.weigh == "likelihood" and not self.programme:
+            raise ValueError(
+                "weigh is likelihood without the programme; the Hungarian matching of V.A goes by r_squared."
             )
         if self.least_samples < 3:
             raise ValueError(f"least_samples is {self.least_samples}; two points always lie on a line: at least 3.")
@@ -135,25 +141,25 @@ def identify(
         return Identification(unnamed, unnamed, empty, empty, empty, empty.astype(bool), None, None, float("nan"))
     foot = np.zeros(2)
     fit, _ = _fits(traces, heard.sequences, focal_px, foot, with_agreement=False)
-    matched, weight, shared = _matched(fit, settings)
+    apart = max(settings.independent_s / traces.step_s(), 1.0)  # frames
+    matched, weight, shared = _matched(fit, settings, apart)
     if settings.origin == "antenna" and shared is not None and shared.mean > 0:
         foot = np.asarray(antenna_m[:2], np.float64) / _height_m(shared, heard.wavelength_m)
         fit, _ = _fits(traces, heard.sequences, focal_px, foot, with_agreement=False)
-        matched, weight, shared = _matched(fit, settings)
+        matched, weight, shared = _matched(fit, settings, apart)
     slope, r_squared = np.asarray(fit.slope, np.float64), np.asarray(fit.r_squared, np.float64)
     kept = keep_edges(slope, shared, settings.threshold) & (weight > 0) & (r_squared >= settings.least_r_squared)
     selection, tag_of = None, matched
     if settings.programme:
         worth, together = weight, None
         if settings.weigh == "likelihood":
-            apart = settings.independent_s / traces.step_s()  # frames
             count = np.asarray(fit.count, np.float64)
             worth = likelihood_weight(weight, count / apart)
-            seen = traces.seen.astype(np.float64)
-            together = seen @ seen.T / apart
+            strong = np.asarray(shared_times(heard.sequences.strong, jnp.asarray(traces.seen)), np.float64)
+            together = strong / apart
             if settings.slope_spread is not None and shared is not None:
                 worth = worth + slope_log_odds(slope, shared, settings.slope_spread) + settings.named_nats
-                kept = (count >= settings.least_samples) & (worth > 0) & (r_squared >= settings.least_r_squared)
+                kept = (count >= settings.least_samples) & (worth > 0) & (weight >= settings.least_r_squared)
         trace, tag = np.nonzero(kept)
         quadratic = np.zeros((len(trace), len(trace)))
         if settings.mu > 0 and len(trace):
@@ -173,16 +179,22 @@ def _height_m(shared: Coefficient, wavelength_m: float) -> float:
 
 
 def _matched(
-    fit: LineFit, settings: MatchSettings
+    fit: LineFit, settings: MatchSettings, apart: float
 ) -> tuple[Int[np.ndarray, " traces"], Float[np.ndarray, "traces tags"], Coefficient | None]:
-    """The Hungarian matching by R squared, its weights, and the coefficient that its pairs share."""
+    """The Hungarian matching, R squared, and the coefficient that its pairs share; errors `apart` frames are independent.
+
+    By R squared as in the paper, or by how much was seen, in nats: a line through four samples is no coefficient.
+    """
     slope = np.asarray(fit.slope, np.float64)
     weight = np.asarray(fit.r_squared, np.float64)
     weight = np.where(np.asarray(fit.count) >= settings.least_samples, weight, 0.0)
     if settings.positive:
         weight = np.where(slope > 0, weight, 0.0)
-    matched = match_graph(weight)
-    shared = shared_coefficient(slope, matched, spread=settings.spread, least_share=settings.least_spread)
+    nats = None
+    if settings.weigh == "likelihood":
+        nats = likelihood_weight(weight, np.asarray(fit.count, np.float64) / apart)
+    matched = match_graph(weight if nats is None else nats)
+    shared = shared_coefficient(slope, matched, spread=settings.spread, least_share=settings.least_spread, weight=nats)
     return matched, weight, shared
 
 
