@@ -33,12 +33,16 @@ def pair_plot(path: Path, judged: Sequence[Judged]) -> None:
 
 
 def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> None:
-    """Accuracy by number of tags, one line a setting, and the paper's."""
+    """Accuracy by number of tags, one line a setting, beside each other where they are equal, and the paper's."""
     figure = blank(5.5, 4.0)
     axes: Axes = figure.subplots()
-    for name, values in accuracy.items():
-        counts = sorted(values)
-        axes.plot(counts, [values[count] for count in counts], "o-", label=name, alpha=0.8)
+    for number, (name, values) in enumerate(accuracy.items()):
+        counts = np.array(sorted(values))
+        aside = 0.04 * (number - (len(accuracy) - 1) / 2)
+        axes.plot(
+            counts + aside, [values[count] for count in counts.tolist()], "o-", label=name, alpha=0.8, markersize=4
+        )
+    axes.set_xticks(sorted({count for values in accuracy.values() for count in values} | set(PAPER_ACCURACY)))
     axes.plot(list(PAPER_ACCURACY), list(PAPER_ACCURACY.values()), "k+--", markersize=10, label="paper")
     axes.set(xlabel="tags", ylabel="identification accuracy", ylim=(-0.02, 1.05))
     axes.grid(alpha=0.3)
