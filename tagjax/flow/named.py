@@ -91,7 +91,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 _UNTRAINED = ("flownet_s", "flownet_c", "raft_small")
 
-MANNERS: dict[str, tuple[Callable[[FlowFunction], FlowFunction], str]] = {
+SUFFIXES: dict[str, tuple[Callable[[FlowFunction], FlowFunction], str]] = {
     "+wls": (SmoothedFlow, wls.settings_key()),
     "+rest": (SettledFlow, f"{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"),
 }
@@ -99,25 +99,25 @@ MANNERS: dict[str, tuple[Callable[[FlowFunction], FlowFunction], str]] = {
 
 
 def taken_apart(name: str) -> tuple[str, str]:
-    """A flow's name without its `MANNERS`, and those, or nothing."""
+    """A flow's name without its `SUFFIXES`, and those, or nothing."""
     bare = name
-    while (last := _last_manner(bare)) is not None:
+    while (last := _last_suffix(bare)) is not None:
         bare = bare.removesuffix(last)
     return bare, name[len(bare) :]
 
 
-def _last_manner(name: str) -> str | None:
-    return next((manner for manner in MANNERS if name.endswith(manner)), None)
+def _last_suffix(name: str) -> str | None:
+    return next((suffix for suffix in SUFFIXES if name.endswith(suffix)), None)
 
 
 def make_flow(name: str) -> FlowFunction:
     """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
 
-    `pyramid_fine:<weights.npz>` is a variant with the weights of a file, such as fine-tuned ones. With `MANNERS` after
+    `pyramid_fine:<weights.npz>` is a variant with the weights of a file, such as fine-tuned ones. With `SUFFIXES` after
     it, in that order applied. Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
     """
-    if (manner := _last_manner(name)) is not None:
-        return MANNERS[manner][0](make_flow(name.removesuffix(manner)))
+    if (suffix := _last_suffix(name)) is not None:
+        return SUFFIXES[suffix][0](make_flow(name.removesuffix(suffix)))
     if name in CLASSICAL:
         return CLASSICAL[name]()
     path = _weights(name)
@@ -129,8 +129,8 @@ def flow_key(name: str) -> str:
 
     Other weights have another key, wherever they lie, and so have other settings. Errors as of `make_flow`.
     """
-    if (manner := _last_manner(name)) is not None:
-        return f"{flow_key(name.removesuffix(manner))}{manner}-{MANNERS[manner][1]}"
+    if (suffix := _last_suffix(name)) is not None:
+        return f"{flow_key(name.removesuffix(suffix))}{suffix}-{SUFFIXES[suffix][1]}"
     if name in CLASSICAL:
         return name
     path = _weights(name)
@@ -189,7 +189,7 @@ def _weights(name: str) -> Path:
         )
     raise ValueError(
         f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({there}), "
-        f"the path of an .npz file of weights, or <variant>:<path>; {' and '.join(MANNERS)} may follow."
+        f"the path of an .npz file of weights, or <variant>:<path>; {' and '.join(SUFFIXES)} may follow."
     )
 
 

@@ -38,7 +38,7 @@ def select_edges(
     0). Each product x_e x_f of edges that may go together becomes a variable y_ef, 0 to 1. For an edge e and a clique K
     without it, x_e times "at most one of K" gives sum_{f in K} y_ef <= x_e: the linear programme is far tighter than with
     y_ef <= x_e one by one, and mostly whole at the root. Where Q is negative, y_ef >= x_e + x_f - 1. HiGHS ends at the optimum, or with
-    the proven bound at the time limit; at worst nothing is chosen and the bound is the sum of all. Raises `ValueError`
+    the proven bound at the time limit; at worst nothing is chosen and the bound is the sum of all that is positive. Raises `ValueError`
     for Q that is not symmetric or not finite.
     """
     weight, quadratic = np.asarray(weight, np.float64), np.asarray(quadratic, np.float64)
