@@ -32,9 +32,9 @@ from tagjax.config import build
 from tagjax.data.clips import load_clip
 from tagjax.data.flow_cache import pair_flow
 from tagjax.data.store import open_recording, save_recording
-from tagjax.flow.estimates import NetworkFlow, agreement, estimate, one_way, padding
+from tagjax.flow.estimates import NetworkFlow, agreement, estimate, flow_along, one_way, padding
 from tagjax.flow.losses import occluded
-from tagjax.flow.named import CLASSICAL, VARIANTS, flow_along, flow_key, make_flow
+from tagjax.flow.named import CLASSICAL, VARIANTS, flow_key, make_flow
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.flow.pictures import as_bytes, check_pictures
 from tagjax.flow.pyramid import PyramidFlow

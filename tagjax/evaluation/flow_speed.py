@@ -11,9 +11,9 @@ import jax
 import numpy as np
 import optax
 
-from ..flow.estimates import NetworkFlow
+from ..flow.estimates import NetworkFlow, flow_along
 from ..flow.losses import FlowLossSettings
-from ..flow.named import flow_along, make_flow
+from ..flow.named import make_flow
 from ..flow.pyramid import PyramidFlow
 from ..training.flow_step import FlowTrainState, flow_step
 from .timing import Timing, first_call_s, in_own_process, medians_ms, peak_memory_mib

@@ -2,18 +2,18 @@
 
 from typing import TYPE_CHECKING, Any
 
-from .estimates import FlowEstimate, estimate
+from .estimates import FlowEstimate, estimate, flow_along
 from .weights import load_network, packaged_weights, save_weights
 
 if TYPE_CHECKING:
-    from .named import flow_along, make_flow
+    from .named import make_flow
 
 __all__ = ["FlowEstimate", "estimate", "flow_along", "load_network", "make_flow", "packaged_weights", "save_weights"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("flow_along", "make_flow"):
-        from . import named
+    if name == "make_flow":
+        from .named import make_flow
 
-        return getattr(named, name)
+        return make_flow
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -170,9 +170,7 @@ def estimate(flow: AbstractFlowNetwork | HostFlow, first: Any, second: Any) -> F
     one, other = _checked(first, second)
     if not isinstance(network, AbstractFlowNetwork):
         height, width = one.shape[:2]
-        along = getattr(network, "along", None)  # who needs both ways for either has them once
-        ways = next(along((one, other))) if along else (network(one, other), network(other, one))
-        forward, backward = (jnp.asarray(way, jnp.float32) for way in ways)
+        forward, backward = (jnp.asarray(way, jnp.float32) for way in next(flow_along(network, (one, other))))
         return _judged(forward, backward, jnp.asarray([0, 0, width - 1, height - 1], jnp.int32))
     one, place, area = _padded(network, one)
     other, _, _ = _padded(network, other)
@@ -216,3 +214,20 @@ class NetworkFlow:
                 forward, backward = (_still(way, last, grown) for way in _both_ways(self.network, known, features))
                 yield np.asarray(forward)[place], np.asarray(backward)[place]
             before, last, known = picture, grown, features
+
+
+def flow_along(flow: HostFlow, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Flow forward and backward between neighbouring pictures of a video: one pair fewer than pictures.
+
+    Who has a way of its own along a video (`along`) goes that way: a network sees each picture once, what needs both ways
+    has them once. Errors as of `check_pictures`.
+    """
+    along = getattr(flow, "along", None)
+    if along is not None:
+        yield from along(pictures)
+        return
+    before = None
+    for picture in pictures:
+        if before is not None:
+            yield flow(before, picture), flow(picture, before)
+        before = picture

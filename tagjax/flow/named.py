@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import opencv, wls
-from .estimates import NetworkFlow, agreement
+from .estimates import NetworkFlow, agreement, flow_along
 from .opencv import FlowFunction
 from .pictures import as_unit, check_pictures
 from .stillness import BLOCK_PX, GAIN, GENTLE_BLOCK_PX, GENTLE_GAIN, settled
@@ -59,11 +59,16 @@ class SmoothedFlow:
 
     def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Flow forward and backward between neighbouring pictures, each of the other's ways asked for once."""
-        pictures, again = itertools.tee(pictures)
-        for (forward, backward), (one, other) in zip(
-            flow_along(self.flow, pictures), itertools.pairwise(again), strict=True
-        ):
+        for (forward, backward), (one, other) in _with_pictures(self.flow, pictures):
             yield _smoothed(forward, backward, one), _smoothed(backward, forward, other)
+
+
+def _with_pictures(
+    flow: FlowFunction, pictures: Iterable[np.ndarray]
+) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]]:
+    """`flow_along`, each pair's flow with its two pictures."""
+    pictures, again = itertools.tee(pictures)
+    return zip(flow_along(flow, pictures), itertools.pairwise(again), strict=True)
 
 
 @jax.jit
@@ -142,27 +147,11 @@ def flow_key(name: str) -> str:
     return f"{key}-{variant}-{changes[:8]}"
 
 
-def flow_along(flow: FlowFunction, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Flow forward and backward between neighbouring pictures of a video: one pair fewer than pictures.
-
-    A network sees each picture once. Errors as of `check_pictures`.
-    """
-    if isinstance(flow, NetworkFlow | SmoothedFlow | SettledFlow):
-        yield from flow.along(pictures)
-        return
-    before = None
-    for picture in pictures:
-        if before is not None:
-            yield flow(before, picture), flow(picture, before)
-        before = picture
-
-
 def settled_along(
     flow: FlowFunction, pictures: Iterable[np.ndarray], *, gain: float = GAIN, block_px: int = BLOCK_PX
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """`flow_along`, zero where rest explains the pictures as well (`settled`)."""
-    pictures, again = itertools.tee(pictures)
-    for (forward, backward), (one, other) in zip(flow_along(flow, pictures), itertools.pairwise(again), strict=True):
+    for (forward, backward), (one, other) in _with_pictures(flow, pictures):
         yield (
             settled(forward, one, other, gain=gain, block_px=block_px),
             settled(backward, other, one, gain=gain, block_px=block_px),

@@ -33,7 +33,8 @@ def weighted_least_squares(
     """The flow that is smooth within the picture's edges and near the given one, pixels.
 
     `fast_global_smooth` with `confidence` as the weights (as of disparities by consistency, Min et al., TIP 2014), then
-    once more with them divided by 1 + |u - f|^2 / OUTLIER_PX^2 (Cauchy's, reweighted). `picture` from 0 to 1, the one that the flow lies on.
+    once more with them divided by 1 + |u - f|^2 / OUTLIER_PX^2 (Cauchy's, reweighted). `picture` from 0 to 1, the one that
+    the flow lies on.
     """
     smooth, weights = flow_px, confidence
     for _ in range(ROUNDS):

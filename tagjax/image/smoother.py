@@ -24,8 +24,9 @@ def fast_global_smooth(
     The affinity of neighbours is b_pq = exp(-|I_p - I_q| / edge), |.| the mean over the guide's colours. S solves rows and
     columns in turn, exactly each, with strength 1.5 4^(T-t) / (4^T - 1) in round t of T: the Fast Global Smoother (Min et
     al., IEEE TIP 2014), and the quotient its way with weights. A pixel without weight takes what its neighbours on its own
-    side of the guide's edges have, or keeps its own where no weight reaches it. Solved by `jax.lax.linalg.tridiagonal_solve`. Raises `ValueError` for a
-    negative strength, an edge that is not positive and no round.
+    side of the guide's edges have, or keeps its own where no weight reaches it. Solved by
+    `jax.lax.linalg.tridiagonal_solve`. Raises `ValueError` for a negative strength, an edge that is not positive and no
+    round.
     """
     if strength < 0 or edge <= 0 or num_rounds < 1:
         raise ValueError(

@@ -151,20 +151,21 @@ def identify(
     kept = keep_edges(slope, shared, settings.threshold) & (weight > 0) & (r_squared >= settings.least_r_squared)
     selection, tag_of = None, matched
     if settings.programme:
-        worth, together = weight, None
+        worth = weight
         if settings.weigh == "likelihood":
             count = np.asarray(fit.count, np.float64)
             worth = likelihood_weight(weight, count / apart)
-            strong = np.asarray(shared_times(heard.sequences.strong, jnp.asarray(traces.seen)), np.float64)
-            together = strong / apart
             if settings.slope_spread is not None and shared is not None:
                 worth = worth + slope_log_odds(slope, shared, settings.slope_spread) + settings.named_nats
                 kept = (count >= settings.least_samples) & (worth > 0) & (weight >= settings.least_r_squared)
         trace, tag = np.nonzero(kept)
         quadratic = np.zeros((len(trace), len(trace)))
         if settings.mu > 0 and len(trace):
-            _, agreed = _fits(traces, heard.sequences, focal_px, foot, with_agreement=True)
-            quadratic = settings.mu * edge_agreement(np.asarray(agreed), trace, tag, together)
+            _, compared = _fits(traces, heard.sequences, focal_px, foot, with_agreement=True)
+            assert compared is not None
+            agreed, times = (np.asarray(each, np.float64) for each in compared)
+            together = times / apart if settings.weigh == "likelihood" else None
+            quadratic = settings.mu * edge_agreement(agreed, trace, tag, together)
         rows = cliques(trace, tag, traces.spans_s(), tolerance_s=settings.overlap_s)
         selection = select_edges(worth[trace, tag], quadratic, rows, time_limit_s=settings.time_limit_s)
         tag_of = unnamed.copy()
@@ -200,13 +201,13 @@ def _matched(
 
 def _fits(
     traces: Traces, said: TagSequences, focal_px: float, foot: Shaped[np.ndarray, " 2"], *, with_agreement: bool
-) -> tuple[LineFit, Array | None]:
-    """Fits of all pairs, and their agreements if asked for; traces are padded, so that few shapes are compiled."""
+) -> tuple[LineFit, tuple[Array, Array] | None]:
+    """Fits of all pairs, and if asked for their agreements and at how many times those are of; traces are padded, so that few shapes are compiled."""
     num = len(traces.number)
     pad = max(_PAD_TRACES, -(-num // _PAD_TRACES) * _PAD_TRACES) - num
     direction = np.pad(np.where(traces.seen[..., None], traces.direction, 0.0), ((0, pad), (0, 0), (0, 0)))
     seen = np.pad(traces.seen, ((0, pad), (0, 0)))
-    fit, agreed = _score(
+    fit, compared = _score(
         jnp.asarray(direction, jnp.float32),
         jnp.asarray(seen),
         said,
@@ -214,7 +215,7 @@ def _fits(
         jnp.asarray(foot, jnp.float32),
         with_agreement=with_agreement,
     )
-    return jax.tree.map(lambda x: x[:num], fit), None if agreed is None else agreed[:num, :num]
+    return jax.tree.map(lambda x: x[:num], fit), jax.tree.map(lambda x: x[:num, :num], compared)
 
 
 @eqx.filter_jit
@@ -226,10 +227,10 @@ def _score(
     foot: Float[Array, " 2"],
     *,
     with_agreement: bool,
-) -> tuple[LineFit, Array | None]:
+) -> tuple[LineFit, tuple[Array, Array] | None]:
     distance_px = focal_px * jnp.sqrt(jnp.sum((direction - foot[None, None, :]) ** 2, axis=-1))
     gamma = translating_factor(distance_px, focal_px)
     fit = fit_pairs(gamma, seen, said.phase_rad, said.heard, said.piece)
     if not with_agreement:
         return fit, None
-    return fit, agreement(said.rssi_dbm, said.strong, distance_px, seen)
+    return fit, (agreement(said.rssi_dbm, said.strong, distance_px, seen), shared_times(said.strong, seen))
