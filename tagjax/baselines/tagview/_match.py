@@ -142,22 +142,19 @@ def identify(
     foot = np.zeros(2)
     fit, _ = _fits(traces, heard.sequences, focal_px, foot, with_agreement=False)
     apart = max(settings.independent_s / traces.step_s(), 1.0)  # frames
-    matched, weight, shared = _matched(fit, settings, apart)
+    matched, weight, worth, shared = _matched(fit, settings, apart)
     if settings.origin == "antenna" and shared is not None and shared.mean > 0:
         foot = np.asarray(antenna_m[:2], np.float64) / _height_m(shared, heard.wavelength_m)
         fit, _ = _fits(traces, heard.sequences, focal_px, foot, with_agreement=False)
-        matched, weight, shared = _matched(fit, settings, apart)
+        matched, weight, worth, shared = _matched(fit, settings, apart)
     slope, r_squared = np.asarray(fit.slope, np.float64), np.asarray(fit.r_squared, np.float64)
     kept = keep_edges(slope, shared, settings.threshold) & (weight > 0) & (r_squared >= settings.least_r_squared)
     selection, tag_of = None, matched
     if settings.programme:
-        worth = weight
-        if settings.weigh == "likelihood":
-            count = np.asarray(fit.count, np.float64)
-            worth = likelihood_weight(weight, count / apart)
-            if settings.slope_spread is not None and shared is not None:
-                worth = worth + slope_log_odds(slope, shared, settings.slope_spread) + settings.named_nats
-                kept = (count >= settings.least_samples) & (worth > 0) & (weight >= settings.least_r_squared)
+        if settings.slope_spread is not None and shared is not None:
+            worth = worth + slope_log_odds(slope, shared, settings.slope_spread) + settings.named_nats
+            enough = np.asarray(fit.count) >= settings.least_samples
+            kept = enough & (worth > 0) & (weight >= settings.least_r_squared)
         trace, tag = np.nonzero(kept)
         quadratic = np.zeros((len(trace), len(trace)))
         if settings.mu > 0 and len(trace):
@@ -181,28 +178,39 @@ def _height_m(shared: Coefficient, wavelength_m: float) -> float:
 
 def _matched(
     fit: LineFit, settings: MatchSettings, apart: float
-) -> tuple[Int[np.ndarray, " traces"], Float[np.ndarray, "traces tags"], Coefficient | None]:
-    """The Hungarian matching, R squared, and the coefficient that its pairs share; errors `apart` frames are independent.
+) -> tuple[
+    Int[np.ndarray, " traces"], Float[np.ndarray, "traces tags"], Float[np.ndarray, "traces tags"], Coefficient | None
+]:
+    """The Hungarian matching, R squared, what each pair is worth, and the coefficient that the matched ones share.
 
-    By R squared as in the paper, or by how much was seen, in nats: a line through four samples is no coefficient.
+    Worth is R squared as in the paper, or by `weigh` likelihood how much was seen, in nats, errors `apart` frames being
+    independent: a line through four samples is no coefficient.
     """
     slope = np.asarray(fit.slope, np.float64)
     weight = np.asarray(fit.r_squared, np.float64)
     weight = np.where(np.asarray(fit.count) >= settings.least_samples, weight, 0.0)
     if settings.positive:
         weight = np.where(slope > 0, weight, 0.0)
-    nats = None
-    if settings.weigh == "likelihood":
-        nats = likelihood_weight(weight, np.asarray(fit.count, np.float64) / apart)
-    matched = match_graph(weight if nats is None else nats)
-    shared = shared_coefficient(slope, matched, spread=settings.spread, least_share=settings.least_spread, weight=nats)
-    return matched, weight, shared
+    by_likelihood = settings.weigh == "likelihood"
+    worth = likelihood_weight(weight, np.asarray(fit.count, np.float64) / apart) if by_likelihood else weight
+    matched = match_graph(worth)
+    shared = shared_coefficient(
+        slope,
+        matched,
+        spread=settings.spread,
+        least_share=settings.least_spread,
+        weight=worth if by_likelihood else None,
+    )
+    return matched, weight, worth, shared
 
 
 def _fits(
     traces: Traces, said: TagSequences, focal_px: float, foot: Shaped[np.ndarray, " 2"], *, with_agreement: bool
 ) -> tuple[LineFit, tuple[Array, Array] | None]:
-    """Fits of all pairs, and if asked for their agreements and at how many times those are of; traces are padded, so that few shapes are compiled."""
+    """Fits of all pairs, and if asked for their agreements and of how many times those are.
+
+    Traces are padded, so that few shapes are compiled.
+    """
     num = len(traces.number)
     pad = max(_PAD_TRACES, -(-num // _PAD_TRACES) * _PAD_TRACES) - num
     direction = np.pad(np.where(traces.seen[..., None], traces.direction, 0.0), ((0, pad), (0, 0), (0, 0)))
