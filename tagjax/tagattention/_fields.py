@@ -59,6 +59,9 @@ class AbstractTagAttention(AbstractSmoother):
     log_anchor_rate: Float[Array, ""]
     anchor_unseen: Float[Array, ""]
     log_foreground_weight: Float[Array, ""]
+    log_fate_weight: Float[Array, ""]
+    log_fate_spread: Float[Array, ""]
+    log_fate_slack: Float[Array, ""]
     log_rivalry: Float[Array, ""]
     rest_doubt: Float[Array, ""]
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float
 from .._numerics import safe_sqrt
 from ..anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
 from ..background import Background, empty_background, is_background, remember, shows_rest
-from ..motion import MotionMap, carry, empty_motion, push_gather
+from ..common_fate import common_fate
+from ..motion import MotionMap, PlaceMap, carry, empty_motion, empty_places, push_gather, push_places
 from ..phase_memory import PhaseMemory, carry_phases
 from ..propagation import propagate, rival_log_odds, soft_clip
 from ..rf.reads import PhaseReads, RadioWindow
@@ -53,14 +54,18 @@ class _Observation(eqx.Module):
     belief: Belief
     step_m: Float[Array, "antenna height width"]
     recent: Bool[Array, "height width"]
+    shift_m: Float[Array, "rows columns 3"]  # of each segment in space over the window,
+    shifted: Float[Array, "rows columns"]  # and of how many of its pixels that is known
 
 
 class TagAttentionState(eqx.Module):
     """Everything a frame hands to the next: fixed shapes, whatever the length of the recording."""
 
     motion: MotionMap
+    places: PlaceMap
     time_s: Float[Array, " window"]
     log_odds: Float[Array, "tag height width"]
+    fate: Float[Array, "tag height width"]  # log odds, at most 0, of moving in space as the tag's object does
     place: Place
     anchor: Anchor
     background: Background
@@ -75,8 +80,10 @@ class AbstractStages(AbstractEvidence):
         num_tags, num_antennas, num_window = frame.radio.relative_m.shape
         return TagAttentionState(
             motion=jax.vmap(lambda _: empty_motion(height, width, num_window))(camera.antennas_m),
+            places=empty_places(height, width, num_window),
             time_s=jnp.broadcast_to(frame.time_s, (num_window,)),
             log_odds=jnp.zeros((num_tags, height, width)),
+            fate=jnp.zeros((num_tags, height, width)),
             place=Place(
                 jnp.zeros((num_tags, 3)),
                 jnp.zeros((num_tags, 3)),
@@ -95,12 +102,14 @@ class AbstractStages(AbstractEvidence):
             belief = jax.vmap(self._with_hindsight, in_axes=(None, 0, 0, 0))(view, belief, state.anchor, frame.later)
             moved = jnp.maximum(moved, frame.later.moved)
         rivals = soft_clip(rival_log_odds(belief.held + belief.near), jnp.exp(self.log_rivalry))
-        mask, place, sure = jax.vmap(self._locate, in_axes=(None, 0, 0, 0))(view, belief, rivals, state.place)
+        shown = jax.vmap(self._shown, in_axes=(None, 0, 0))(view, belief, rivals)
+        fate, shared = jax.vmap(self._share_fate, in_axes=(None, 0, 0, 0))(seen, shown, state.fate, state.place)
+        mask, place, sure = jax.vmap(self._locate, in_axes=(None, 0, 0, 0))(view, belief, shown + shared, state.place)
         # Whether there is anything to claim is doubted, not where it is: the place is kept as it is.
         confidence = jax.nn.sigmoid(sure - self._doubt(jnp.max(moved, axis=1)))
         out = describe(mask, place.centre_m, seen.step_m, seen.recent, confidence, self.box_tail)
         # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
-        return eqx.tree_at(lambda one: one.place, state, jax.lax.stop_gradient(place)), out
+        return eqx.tree_at(lambda one: (one.fate, one.place), state, (fate, jax.lax.stop_gradient(place))), out
 
     def look_back(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Later]:
         state, seen = self._observe(camera, state, frame)
@@ -141,13 +150,28 @@ class AbstractStages(AbstractEvidence):
         carried = jnp.where((followed | ~valid)[None], moved, recalled)
 
         phases = carry_phases(state.phases, backward_px, followed)
+        places = push_places(state.places, backward_px, points, max_step_m)
+        shift_m, known = places.shift_m()
+        shift_m, shifted = pool(view.segments, shift_m, known.astype(shift_m.dtype))
+        fate = jnp.moveaxis(carry(jnp.moveaxis(state.fate, 0, -1), backward_px, jnp.zeros(())), -1, 0)
+        fate = jnp.where(followed[None], fate, 0.0)
 
         belief, anchor, phases = jax.vmap(self._believe, in_axes=(None, 0, 0, 0, 0, 0))(
             view, carried, frame.radio, frame.reads, state.anchor, phases
         )
         background = remember(state.background, distance, valid, belief.log_odds)
-        state = TagAttentionState(motion, time_s, belief.log_odds, state.place, anchor, background, phases)
-        return state, _Observation(view, belief, step_m, recent)
+        state = TagAttentionState(
+            motion=motion,
+            places=places,
+            time_s=time_s,
+            log_odds=belief.log_odds,
+            fate=fate,
+            place=state.place,
+            anchor=anchor,
+            background=background,
+            phases=phases,
+        )
+        return state, _Observation(view, belief, step_m, recent, shift_m, shifted)
 
     def finish(self, state: TagAttentionState) -> TagAttentionState:
         return state
@@ -204,27 +228,59 @@ class AbstractStages(AbstractEvidence):
         )
         return Belief(*self._spread(view, log_odds), jnp.sum(nears, axis=0))
 
-    def _locate(
-        self,
-        view: View,
-        belief: Belief,
-        rivals: Float[Array, "height width"],
-        place: Place,
-    ) -> tuple[Float[Array, "height width"], Place, Float[Array, ""]]:
-        """One tag's soft mask, place, and log odds of the claim, by what is believed of it and of the other tags."""
-        valid, held, near = view.valid, belief.held, belief.near
+    def _shown(self, view: View, belief: Belief, rivals: Float[Array, "height width"]) -> Float[Array, "height width"]:
+        """One tag's log odds of what can be cut out: by radio, rivals, and what stands before the background."""
+        held, near = belief.held, belief.near
         # Where nothing else can be its object, a tag shares one with its rivals. A maximum has the gradient 0 / 0 where it
         # is computed once more and rounded otherwise, as in the backward pass; and far from even odds it has none.
-        elsewhere = jax.lax.stop_gradient(jnp.max(jnp.where(valid, held + near - rivals, -9.0)))
+        elsewhere = jax.lax.stop_gradient(jnp.max(jnp.where(view.valid, held + near - rivals, -9.0)))
         rivals = rivals * jax.nn.sigmoid(elsewhere)
         # What carries the tag moves, so it stands before what has always been there; but where it began it is itself
         # what is remembered, and evidence outweighs that.
         front = jnp.where(view.front < 0, view.front * jax.nn.sigmoid(-held), view.front)
-        shown = held + near + jnp.exp(self.log_foreground_weight) * front - rivals
+        return held + near + jnp.exp(self.log_foreground_weight) * front - rivals
+
+    def _share_fate(
+        self,
+        seen: _Observation,
+        shown: Float[Array, "height width"],
+        carried: Float[Array, "height width"],
+        place: Place,
+    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
+        """One tag's log odds by common fate, as they are carried on and as segments share them.
+
+        They tell what else belongs to an object that was claimed at the last frame, not which object is the tag's.
+        """
+        view = seen.view
+        weight = view.valid.astype(shown.dtype)
+        before = pool(view.segments, jnp.stack([shown, carried], axis=-1), weight)[0]
+        told = common_fate(
+            seen.shift_m,
+            seen.shifted,
+            jnp.sum(before, axis=-1),
+            spread_m=jnp.exp(self.log_fate_spread),
+            slack=jnp.exp(self.log_fate_slack),
+            floor=jnp.exp(self.log_floor),
+        )
+        claimed = jax.nn.relu(2.0 * place.confidence - 1.0)
+        told = unpool(view.segments, (jnp.exp(self.log_fate_weight) * claimed * told)[..., None])[..., 0]
+        kept = jnp.exp(-view.elapsed_s / jnp.exp(self.log_memory))
+        fate = propagate(carried, told, jnp.ones(()), kept)
+        shared = unpool(view.segments, pool(view.segments, fate[..., None], weight)[0])[..., 0]
+        return fate, jnp.where(view.valid, shared, 0.0)
+
+    def _locate(
+        self,
+        view: View,
+        belief: Belief,
+        shown: Float[Array, "height width"],
+        place: Place,
+    ) -> tuple[Float[Array, "height width"], Place, Float[Array, ""]]:
+        """One tag's soft mask, place, and log odds of the claim, which rest on the radio alone."""
         predicted = place.centre_m + place.velocity_m_s * view.elapsed_s * jax.nn.sigmoid(self.logit_inertia)
         mask, centre = self._cut(view, shown, predicted, place)
-        told = belief.log_odds + jax.nn.sigmoid(self.logit_range_share) * near
-        sure = jnp.max(jnp.where((mask > 0.5) & valid, told, -9.0))
+        told = belief.log_odds + jax.nn.sigmoid(self.logit_range_share) * belief.near
+        sure = jnp.max(jnp.where((mask > 0.5) & view.valid, told, -9.0))
         confidence = jax.nn.sigmoid(sure)
         both = (place.confidence > 0.5) & (confidence > 0.5)
         move = jnp.clip((centre - place.centre_m) / view.elapsed_s, -self.max_speed_m_s, self.max_speed_m_s)

@@ -5,7 +5,7 @@ with the tag's (Eqs. 4-6), and coherence and phase memory with the raw phase rea
 flow and updated (Eq. 7 with a background class and forgetting), pooled in the segments (III.G), and cut.
 
 What goes beyond the paper: the range anchor, by which all of the past says how far away the tag is now; a memory of
-the still background; tags that compete for pixels; and an object is one compact thing in 3D, next to where it was a frame
+the still background; tags that compete for pixels; common fate in space of what is found; and an object is one compact thing in 3D, next to where it was a frame
 ago. `paper_limit` gives the settings at which all of it is gone and the likelihood and the cut are the paper's.
 """
 
@@ -48,6 +48,7 @@ def paper_limit() -> dict[str, Any]:
         "anchor_limit": nothing,
         "anchor_rate": nothing,
         "foreground_weight": nothing,
+        "fate_weight": nothing,
         "rivalry": nothing,
         "rest_doubt": 0.0,
         "cut_rule": "cdf_corner",
@@ -104,6 +105,9 @@ class TagAttention(AbstractStages):
         anchor_rate: float = 0.3,
         anchor_unseen: float = -1.0,
         foreground_weight: float = 3.0,
+        fate_weight: float = 0.001,
+        fate_spread_m: float = 0.015,
+        fate_slack: float = 0.25,
         rivalry: float = 16.0,
         cell: int = 6,
         max_speed_m_s: float = 3.0,
@@ -150,6 +154,9 @@ class TagAttention(AbstractStages):
                 share of it that counts as evidence of the pixel's identity.
             anchor_drift_m: error of the radio's distance that adds up, per frame.
             foreground_weight: pull of what stands before the background.
+            fate_weight: share of the evidence of common fate in space (`tagjax.common_fate`) that counts, a frame.
+            fate_spread_m, fate_slack: how far apart parts of one thing may come over the window, m, and as a share of its
+                own way.
             rivalry: log odds that a pixel of another tag's object counts less, at most; infinite where a thing has one tag.
             rest_doubt, rest_nats: log odds that a claim loses while rest explains all of the tag's reads; against how much
                 evidence of the reads that it has moved, in nats, 1/e of that is left (not learned: chance sets it).
@@ -193,6 +200,9 @@ class TagAttention(AbstractStages):
             anchor_drift_m=anchor_drift_m,
             anchor_rate=anchor_rate,
             foreground_weight=foreground_weight,
+            fate_weight=fate_weight,
+            fate_spread_m=fate_spread_m,
+            fate_slack=fate_slack,
             rivalry=rivalry,
             max_speed_m_s=max_speed_m_s,
             rest_nats=rest_nats,
@@ -240,6 +250,8 @@ class TagAttention(AbstractStages):
         self.log_anchor_depth, self.log_anchor_limit = stored_log(anchor_depth_m), stored_log(anchor_limit)
         self.log_anchor_drift, self.log_anchor_rate = stored_log(anchor_drift_m), stored_log(anchor_rate)
         self.anchor_unseen = jnp.asarray(anchor_unseen, jnp.float32)
+        self.log_fate_weight, self.log_fate_slack = stored_log(fate_weight), stored_log(fate_slack)
+        self.log_fate_spread = stored_log(fate_spread_m)
         self.log_foreground_weight, self.log_rivalry = stored_log(foreground_weight), stored_log(rivalry)
         self.rest_doubt, self.rest_nats = jnp.asarray(rest_doubt, jnp.float32), rest_nats
         self.cell, self.max_speed_m_s = cell, max_speed_m_s
