@@ -18,11 +18,12 @@ import synthetic_clips as synthetic
 import zarr
 
 from tagjax.data import flow_cache, store
+from tagjax.data.backwards import played_backwards
 from tagjax.data.clips import clip_dataset, load_clip
 from tagjax.data.flow_cache import pair_flow
 from tagjax.data.store import StoredFrames, open_recording, save_recording, write_recording
 from tagjax.flow.opencv import make_flow
-from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads
+from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads, Truth
 
 
 def _with_reads(recording: Recording, **columns) -> Recording:
@@ -533,6 +534,25 @@ def test_flow_is_kept_with_the_recording(recording, tmp_path):
         pair_flow(recording, 0, 2, "magic")
 
 
+def test_true_flow_is_what_the_recording_holds(recording):
+    rng, shape = np.random.default_rng(0), (*recording.colour.shape[:3], 2)
+    ahead, back = (rng.normal(size=shape).astype(np.float32) for _ in range(2))
+    ahead[-1] = back[0] = back[3, 5:9] = np.nan
+    known = dataclasses.replace(recording, truth=Truth(flow_px=ahead, backward_flow_px=back))
+    forward, backward = pair_flow(known, 0, 5, "truth")
+    assert not forward[0].any()
+    assert not backward[0].any()
+    np.testing.assert_array_equal(forward[1:], ahead[:4])
+    np.testing.assert_array_equal(backward[1:3], back[1:3])
+    assert not backward[3, 5:9].any()
+    np.testing.assert_array_equal(pair_flow(known, 2, 5, "truth")[1], backward[2:])
+    np.testing.assert_array_equal(
+        pair_flow(played_backwards(known), 7, 9, "truth")[0], pair_flow(known, 4, 6, "truth")[1][::-1]
+    )
+    with pytest.raises(RecordingError, match="does not hold its true flow"):
+        pair_flow(recording, 0, 2, "truth")
+
+
 _CACHE = Path("cache", "flow", "dis_fast")
 
 
@@ -614,8 +634,8 @@ def test_an_interrupted_flow_leaves_the_recording_usable(moving, monkeypatch, st
 
 
 _KILLED = """
-import os, signal, sys
 from tagjax.data import flow_cache, store
+from tagjax.data.backwards import played_backwards
 from tagjax.data.store import open_recording
 
 def slow(name):

@@ -26,12 +26,16 @@ _VERSION = 3
 
 _WAYS = ("forward", "backward")
 
+TRUTH = "truth"
+"""The name of a simulated recording's exact flow: what a tracer would do if no flow were to blame."""
+
 
 def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Flow between frames t - 1 and t for t = first .. last - 1: (forward on t - 1, backward on t).
 
     Both float32 (frames, height, width, 2), pixels of the full picture; zero where there is no frame before, and where
-    rest explains the pictures as well (`settled`). `method` is a flow that `make_flow` knows. The flow of the whole
+    rest explains the pictures as well (`settled`). `method` is a flow that `make_flow` knows, or `truth`: the exact flow that a
+    recording was simulated with, zero where it is not known. The flow of the whole
     recording is computed on the first call and kept in half precision in its folder, under `cache/flow/<key>/`
     (`flow_key`: other weights of a network have another), where that can be written; otherwise only the frames asked
     for are computed.
@@ -40,6 +44,8 @@ def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple
         raise ValueError(f"Frames {first} to {last} asked for; {recording.name} has {recording.num_frames}.")
     if recording.forwards is not None:
         return _backwards(recording.forwards, first, last, method)
+    if method == TRUTH:
+        return _exact(recording, first, last)
     key = flow_key(method)
     folder = _folder(recording, key)
     if folder is None:
@@ -65,6 +71,22 @@ def _backwards(recording: Recording, first: int, last: int, method: str) -> tupl
     if start < last:
         there, back = pair_flow(recording, count + 1 - last, count + 1 - start, method)
         forward[start - first :], backward[start - first :] = back[::-1], there[::-1]
+    return forward, backward
+
+
+def _exact(recording: Recording, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
+    """`pair_flow` of the truth. Raises `RecordingError` for a recording whose flow nobody knows."""
+    truth = recording.truth
+    if truth is None or truth.flow_px is None or truth.backward_flow_px is None:
+        raise RecordingError(
+            f"{recording.name}: flow=truth, but the recording does not hold its true flow both ways. Simulate it with "
+            "`capture: {flow: true}`, as conf/benchmark/corpus.yaml does, or name a flow that is computed (dis)."
+        )
+    forward, backward = (np.zeros((last - first, *recording.colour.shape[1:3], 2), np.float32) for _ in _WAYS)
+    start = max(first, 1)
+    if start < last:
+        forward[start - first :] = np.nan_to_num(truth.flow_px[start - 1 : last - 1])
+        backward[start - first :] = np.nan_to_num(truth.backward_flow_px[start:last])
     return forward, backward
 
 
