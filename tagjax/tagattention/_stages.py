@@ -143,7 +143,8 @@ class AbstractStages(AbstractEvidence):
         )
         view = view_of(camera, points, distances, valid, motion, step_m, time_s, state.background, grouping)
 
-        moved = jnp.moveaxis(carry(jnp.moveaxis(state.log_odds, 0, -1), backward_px, jnp.zeros(())), -1, 0)
+        both = jnp.moveaxis(jnp.concatenate([state.log_odds, state.fate]), 0, -1)
+        moved, fate = jnp.split(jnp.moveaxis(carry(both, backward_px, jnp.zeros(())), -1, 0), 2)
         # A surface that was hidden a frame ago brings no history of its own, but for what its pixel remembers.
         shows = is_background(state.background, distance, valid)
         recalled = jnp.where(shows[None], state.background.log_odds, 0.0)
@@ -153,8 +154,6 @@ class AbstractStages(AbstractEvidence):
         places = push_places(state.places, backward_px, points, max_step_m)
         shift_m, known = places.shift_m()
         shift_m, shifted = pool(view.segments, shift_m, known.astype(shift_m.dtype))
-        fate = jnp.moveaxis(carry(jnp.moveaxis(state.fate, 0, -1), backward_px, jnp.zeros(())), -1, 0)
-        fate = jnp.where(followed[None], fate, 0.0)
 
         belief, anchor, phases = jax.vmap(self._believe, in_axes=(None, 0, 0, 0, 0, 0))(
             view, carried, frame.radio, frame.reads, state.anchor, phases
@@ -165,7 +164,7 @@ class AbstractStages(AbstractEvidence):
             places=places,
             time_s=time_s,
             log_odds=belief.log_odds,
-            fate=fate,
+            fate=jnp.where(followed[None], fate, 0.0),
             place=state.place,
             anchor=anchor,
             background=background,

@@ -5,8 +5,9 @@ with the tag's (Eqs. 4-6), and coherence and phase memory with the raw phase rea
 flow and updated (Eq. 7 with a background class and forgetting), pooled in the segments (III.G), and cut.
 
 What goes beyond the paper: the range anchor, by which all of the past says how far away the tag is now; a memory of
-the still background; tags that compete for pixels; common fate in space of what is found; and an object is one compact thing in 3D, next to where it was a frame
-ago. `paper_limit` gives the settings at which all of it is gone and the likelihood and the cut are the paper's.
+the still background; tags that compete for pixels; an object is one compact thing in 3D, next to where it was a frame ago,
+and moves in space as one. `paper_limit` gives the settings at which all of it is gone and the likelihood and the cut are
+the paper's.
 """
 
 from __future__ import annotations
