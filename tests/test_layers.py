@@ -29,6 +29,7 @@ LAYERS = {
     "motion": 2,
     "attention": 2,
     "propagation": 2,
+    "common_fate": 2,
     "segmentation": 2,
     "anchor": 2,
     "background": 2,

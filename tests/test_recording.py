@@ -634,8 +634,8 @@ def test_an_interrupted_flow_leaves_the_recording_usable(moving, monkeypatch, st
 
 
 _KILLED = """
+import os, signal, sys
 from tagjax.data import flow_cache, store
-from tagjax.data.backwards import played_backwards
 from tagjax.data.store import open_recording
 
 def slow(name):
