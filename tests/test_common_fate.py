@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import synthetic_clips as synthetic
 from scipy.spatial.transform import Rotation
 
 from tagjax.common_fate import common_fate, fate_attention, shared_shift
+from tagjax.geometry import pixel_rays
 from tagjax.motion import empty_places, push_places
-from tagjax.rf.reads import PhaseReads, RadioWindow
+from tagjax.recording import Intrinsics
 from tagjax.tagattention import TagAttention
 from tagjax.tracer import Camera, Frame, trace
 
@@ -116,9 +118,7 @@ def test_jit_is_eager_and_vmap_a_loop():
 
 
 def _rays(height: int, width: int, focal_px: float) -> np.ndarray:
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    middle = ((width - 1) / 2, (height - 1) / 2)
-    return np.stack([(x - middle[0]) / focal_px, (y - middle[1]) / focal_px, np.ones((height, width))], axis=-1)
+    return pixel_rays(Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height))
 
 
 def test_places_follow_a_plane_in_space():
@@ -138,7 +138,7 @@ def test_places_follow_a_plane_in_space():
 
 def _one_distance_two_ways() -> tuple[Camera, Frame, np.ndarray]:
     """A large and a small part side by side whose distances change alike; the small one slides to the right besides."""
-    height, width, num_window, num_frames = 24, 32, 5, 24
+    height, width, num_frames = 24, 32, 24
     time_s = np.arange(num_frames) / 10.0
     rays = _rays(height, width, 40.0)
     parts = np.zeros((2, height, width), bool)
@@ -149,19 +149,8 @@ def _one_distance_two_ways() -> tuple[Camera, Frame, np.ndarray]:
     depth[:, both] = range_m[:, None] / np.linalg.norm(rays[both], axis=-1)
     flow = np.zeros((num_frames, height, width, 2))
     flow[1:, parts[1], 0] = -2.0
-    past = np.maximum(np.arange(num_frames)[:, None] + np.arange(1 - num_window, 1), 0)
-    relative = (range_m[past] - range_m[past[:, :1]])[:, None, None]
-    shape = (num_frames, 1, 1, 4)
-    none = jnp.zeros(shape)
-    frames = Frame(
-        time_s=jnp.asarray(time_s, jnp.float32),
-        depth_m=jnp.asarray(depth, jnp.float32),
-        backward_px=jnp.asarray(flow, jnp.float32),
-        forward_px=jnp.asarray(-flow, jnp.float32),
-        radio=RadioWindow(jnp.asarray(relative, jnp.float32), jnp.full(relative.shape, 0.005)),
-        reads=PhaseReads(none, none, none, none, jnp.zeros(shape, jnp.int32), jnp.zeros(shape, bool)),
-    )
-    return Camera(jnp.asarray(rays, jnp.float32), jnp.zeros((1, 3))), frames, parts
+    frames = synthetic.unread_frames(time_s, depth, range_m[None, None], flow)
+    return Camera(jnp.asarray(rays), jnp.zeros((1, 3))), frames, parts
 
 
 @pytest.mark.ci

@@ -10,8 +10,10 @@ import pytest
 import synthetic_clips as synthetic
 
 from tagjax.data.clips import load_clip
+from tagjax.geometry import pixel_rays
 from tagjax.motion import empty_motion, push_gather, push_splat
-from tagjax.rf.reads import PhaseReads, RadioWindow
+from tagjax.recording import Intrinsics
+from tagjax.rf.reads import RadioWindow
 from tagjax.tagattention import TagAttention, paper_limit
 from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
 from tagjax.tracer import Camera, Frame, Later, describe, trace
@@ -142,10 +144,9 @@ def _side_by_side() -> tuple[Camera, Frame, np.ndarray]:
 
     To an antenna in the middle both are always equally far; as one at the side sees it, one comes while the other goes.
     """
-    height, width, num_window = 24, 32, 5
+    height, width = 24, 32
     time_s = np.arange(24) / 10.0
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack([(x - 15.5) / 20.0, (y - 11.5) / 20.0, np.ones_like(x)], axis=-1)
+    rays = pixel_rays(Intrinsics(20.0, 20.0, 15.5, 11.5, width, height))
     boxes = np.zeros((2, height, width), bool)
     boxes[0, 6:18, 3:12] = boxes[1, 6:18, 20:29] = True
     depth = np.full((len(time_s), height, width), 4.0)
@@ -153,24 +154,9 @@ def _side_by_side() -> tuple[Camera, Frame, np.ndarray]:
     antennas = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 2.0]])
     ranges = np.linalg.norm(rays[None, None] * depth[None, ..., None] - antennas[:, None, None, None], axis=-1)
     of_tag = np.stack([ranges[:, :, 12, 7], ranges[:, :, 12, 24]])  # tag, antenna, frame: at the middles
-    past = np.maximum(np.arange(len(time_s))[:, None] + np.arange(1 - num_window, 1), 0)
-    relative = np.moveaxis(of_tag[..., past] - of_tag[..., past[:, :1]], 2, 0)
-    np.testing.assert_allclose(relative[:, 0, 0], relative[:, 1, 0], atol=1e-12)
-    shape = (len(time_s), 2, 2, 4)
-    none = jnp.zeros(shape)
-    flow = jnp.zeros((len(time_s), height, width, 2))
-    return (
-        Camera(jnp.asarray(rays, jnp.float32), jnp.asarray(antennas, jnp.float32)),
-        Frame(
-            time_s=jnp.asarray(time_s, jnp.float32),
-            depth_m=jnp.asarray(depth, jnp.float32),
-            backward_px=flow,
-            forward_px=flow,
-            radio=RadioWindow(jnp.asarray(relative, jnp.float32), jnp.full(relative.shape, 0.005)),
-            reads=PhaseReads(none, none, none, none, jnp.zeros(shape, jnp.int32), jnp.zeros(shape, bool)),
-        ),
-        boxes,
-    )
+    np.testing.assert_allclose(of_tag[0, 0], of_tag[1, 0], atol=1e-12)
+    frames = synthetic.unread_frames(time_s, depth, of_tag, np.zeros((len(time_s), height, width, 2)))
+    return Camera(jnp.asarray(rays), jnp.asarray(antennas, jnp.float32)), frames, boxes
 
 
 @pytest.mark.ci

@@ -6,6 +6,7 @@ import contextlib
 import os
 import shutil
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +35,10 @@ def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple
     """Flow between frames t - 1 and t for t = first .. last - 1: (forward on t - 1, backward on t).
 
     Both float32 (frames, height, width, 2), pixels of the full picture; zero where there is no frame before, and where
-    rest explains the pictures as well (`settled`). `method` is a flow that `make_flow` knows, or `truth`: the exact flow that a
-    recording was simulated with, zero where it is not known. The flow of the whole
-    recording is computed on the first call and kept in half precision in its folder, under `cache/flow/<key>/`
-    (`flow_key`: other weights of a network have another), where that can be written; otherwise only the frames asked
-    for are computed.
+    rest explains the pictures as well (`settled`). `method` is a flow that `make_flow` knows, or `truth`: the exact flow
+    that a recording was simulated with, zero where it is not known. What is computed is computed for the whole recording
+    on the first call and kept in half precision in its folder, under `cache/flow/<key>/` (`flow_key`: other weights of a
+    network have another), where that can be written; otherwise only for the frames asked for.
     """
     if first < 0 or last > recording.num_frames or first >= last:
         raise ValueError(f"Frames {first} to {last} asked for; {recording.name} has {recording.num_frames}.")
@@ -66,27 +66,39 @@ def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple
 def _backwards(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
     """`pair_flow` of the recording played backwards: the same pairs, with the two ways exchanged."""
     count = recording.num_frames
-    forward, backward = (np.zeros((last - first, *recording.colour.shape[1:3], 2), np.float32) for _ in _WAYS)
-    start = max(first, 1)
-    if start < last:
-        there, back = pair_flow(recording, count + 1 - last, count + 1 - start, method)
-        forward[start - first :], backward[start - first :] = back[::-1], there[::-1]
-    return forward, backward
+
+    def exchanged(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        there, back = pair_flow(recording, count + 1 - stop, count + 1 - start, method)
+        return back[::-1], there[::-1]
+
+    return _after_none(recording, first, last, exchanged)
 
 
 def _exact(recording: Recording, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
     """`pair_flow` of the truth. Raises `RecordingError` for a recording whose flow nobody knows."""
     truth = recording.truth
-    if truth is None or truth.flow_px is None or truth.backward_flow_px is None:
+    ahead, back = (truth.flow_px, truth.backward_flow_px) if truth is not None else (None, None)
+    if ahead is None or back is None:
         raise RecordingError(
             f"{recording.name}: flow=truth, but the recording does not hold its true flow both ways. Simulate it with "
             "`capture: {flow: true}`, as conf/benchmark/corpus.yaml does, or name a flow that is computed (dis)."
         )
+    return _after_none(
+        recording,
+        first,
+        last,
+        lambda start, stop: (np.nan_to_num(ahead[start - 1 : stop - 1]), np.nan_to_num(back[start:stop])),
+    )
+
+
+def _after_none(
+    recording: Recording, first: int, last: int, ways: Callable[[int, int], tuple[np.ndarray, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """`pair_flow` by a function that knows it from frame 1 on; zero for frame 0, which has none before it."""
     forward, backward = (np.zeros((last - first, *recording.colour.shape[1:3], 2), np.float32) for _ in _WAYS)
     start = max(first, 1)
     if start < last:
-        forward[start - first :] = np.nan_to_num(truth.flow_px[start - 1 : last - 1])
-        backward[start - first :] = np.nan_to_num(truth.backward_flow_px[start:last])
+        forward[start - first :], backward[start - first :] = ways(start, last)
     return forward, backward
 
 

@@ -252,11 +252,11 @@ class AbstractStages(AbstractEvidence):
         """
         view = seen.view
         weight = view.valid.astype(shown.dtype)
-        before = pool(view.segments, jnp.stack([shown, carried], axis=-1), weight)[0]
+        before, _ = pool(view.segments, (shown + carried)[..., None], weight)
         told = common_fate(
             seen.shift_m,
             seen.shifted,
-            jnp.sum(before, axis=-1),
+            before[..., 0],
             spread_m=jnp.exp(self.log_fate_spread),
             slack=jnp.exp(self.log_fate_slack),
             floor=jnp.exp(self.log_floor),
