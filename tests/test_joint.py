@@ -113,7 +113,8 @@ def test_the_loss_moves_as_its_gradient_says(clip):
         frames, camera = _in_double(clip.frames), _in_double(clip.camera)
         slope = jnp.linspace(0.0, 0.6, frames.depth_m.shape[2])
         frames = eqx.tree_at(lambda f: f.depth_m, frames, frames.depth_m + slope.reshape(1, 1, -1))
-        gradient, logged = clip_gradient(model, camera, frames, KEY, OBJECTIVE)
+        each = dataclasses.replace(OBJECTIVE, term_norms=True)
+        gradient, logged = clip_gradient(model, camera, frames, KEY, each)
         loss = lambda model: float(clip_loss(model, camera, frames, KEY, OBJECTIVE)["loss"])  # noqa: E731
         assert float(logged["loss"]) == pytest.approx(loss(model), rel=1e-9)
         rng = np.random.default_rng(5)

@@ -35,6 +35,7 @@ from tagjax.training.loss import (
     clip_reads,
     compactness,
     contrast,
+    coverage,
     distance_at,
     future_agreement,
     objective,
@@ -234,6 +235,33 @@ def test_priors_have_the_gradient_of_their_masks(gradients_agree, name: str) -> 
     assert bool(jnp.isfinite(empty(jnp.zeros_like(seen.said.mask))).all())
 
 
+def test_coverage_by_log_dice_calls_a_lost_mask_back() -> None:
+    clip = _clip(16)
+    last = dataclasses.replace(SETTINGS, skip_frames=100)  # one frame is asked: there the two are 1 - d and - log d
+    logarithm = dataclasses.replace(last, coverage_by="log_dice")
+    agrees, valid, weight = (
+        np.asarray(each[-1]) for each in eqx.filter_jit(future_agreement)(clip.camera, clip.frames, last)
+    )
+    assert valid.all() and (agrees.sum((-2, -1)) > 1.0).all()
+    share = np.random.default_rng(0).uniform(size=clip.frames.depth_m.shape[1:])
+    seen = _masked(clip, share)
+    dice = 2 * (share * agrees).sum((-2, -1)) / ((share**2).sum() + (agrees**2).sum((-2, -1)) + 1)
+    for settings, lost in ((last, 1.0 - dice), (logarithm, -np.log(dice))):
+        assert float(eqx.filter_jit(coverage)(seen, settings, KEY)[0]) == pytest.approx(
+            np.average(lost, weights=weight), rel=1e-4
+        )
+
+    # Of a mask far below its edge the logarithm falls with the log odds that bring it back; 1 - d does not.
+    def of_level(level: jax.Array, settings: ObjectiveSettings) -> jax.Array:
+        mask = jnp.full_like(seen.said.mask, jax.nn.sigmoid(level))
+        return coverage(eqx.tree_at(lambda s: s.said.mask, seen, mask), settings, KEY)[0]
+
+    slope = jax.jit(jax.grad(of_level), static_argnums=1)
+    assert float(slope(jnp.asarray(-12.0), logarithm)) == pytest.approx(-1.0, abs=0.1)
+    assert abs(float(slope(jnp.asarray(-12.0), last))) < 1e-3
+    assert bool(jnp.isfinite(slope(jnp.asarray(-200.0), logarithm)))
+
+
 def test_a_clip_without_reads_or_depth_gives_finite_gradients() -> None:
     clip = _clip(12)
     deaf = eqx.tree_at(lambda f: f.reads.valid, clip.frames, jnp.zeros_like(clip.frames.reads.valid))
@@ -301,7 +329,18 @@ def test_training_lowers_the_loss_and_finds_the_objects() -> None:
     after = clip_loss(state.tracer, held_out.camera, held_out.frames, KEY, SETTINGS)
     assert float(after["loss"]) < 0.7 * float(before["loss"])
     assert float(after["own_coherence"]) > float(before["own_coherence"]) + 0.1
-    assert {"contrast", "coverage", "gradient_norm/contrast", "gradient_norm/coverage", "skipped"} <= set(numbers)
+    assert {"contrast", "coverage", "gradient_norm", "skipped"} <= set(numbers)
+
+
+def test_term_norms_cost_time_and_change_nothing() -> None:
+    clip, asked = _clip(12), dataclasses.replace(SETTINGS, term_norms=True)
+    tracer = synthetic.SmallTracer(40.0, 0.0)
+    plain, numbers = clip_gradient(tracer, clip.camera, clip.frames, KEY, SETTINGS)
+    by_term, more = clip_gradient(tracer, clip.camera, clip.frames, KEY, asked)
+    for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(by_term), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+    assert set(more) - set(numbers) == {"gradient_norm/contrast", "gradient_norm/coverage"}
+    assert all(float(more[name]) > 0 for name in set(more) - set(numbers))
 
 
 def test_a_gradient_that_is_not_finite_is_skipped() -> None:

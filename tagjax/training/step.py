@@ -1,4 +1,4 @@
-"""One training step: gradients of every term through the whole tracer, clipped and guarded, then the update.
+"""One training step: the gradient through the whole tracer, clipped and guarded, then the update.
 
 The gradient is the mean over a step's clips. One device takes them one after the other (gradient accumulation: memory
 is that of one clip); several devices take as many at a time, each a clip of its own; several processes do so each with
@@ -67,7 +67,7 @@ def make_joint_optimizer(
 def clip_gradient(
     model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
-    """Gradient of the weighted objective of one clip, and each term's value and gradient norm.
+    """Gradient of the weighted objective of one clip, each term's value, and with `term_norms` its gradient's norm.
 
     Of a `JointModel` the norm of a term is that of its gradient by the tracer's parameters; a second one is by the flow.
     """
@@ -103,7 +103,10 @@ def _term_gradients(
     key: Array,
     settings: ObjectiveSettings,
 ) -> tuple[tuple[PyTree, Flow | None], dict[str, Float[Array, ""]]]:
-    """Gradient of the weighted terms by the tracer and, where it is given, by the flow; and what there is to log."""
+    """Gradient of the weighted terms by the tracer and, where it is given, by the flow; and what there is to log.
+
+    Backwards in time is most of the work: it is done once, or once a term where each term's norm is asked for.
+    """
     learnable, rest = eqx.partition(tracer, eqx.is_inexact_array)
     weights = settings.weights()
 
@@ -113,19 +116,22 @@ def _term_gradients(
         return objective(eqx.combine(learnable, rest), camera, seen, key, settings)
 
     values, pull, diagnostics = jax.vjp(terms, (learnable, flow), has_aux=True)
-    # One batched pull-back of all terms: compiled once, however many there are.
-    names = list(weights)
-    chosen = {name: jnp.asarray([float(other == name) for other in names], values[name].dtype) for name in names}
-    (gradients,) = jax.vmap(pull)(chosen)
-    logged = dict(diagnostics)
-    for number, name in enumerate(names):
-        logged[name] = values[name]
-        by_tracer, by_flow = jax.tree.map(lambda leaf, n=number: leaf[n], gradients)
-        logged[f"gradient_norm/{name}"] = optax.tree.norm(by_tracer)
-        if flow is not None:
-            logged[f"gradient_norm/{name}/flow"] = optax.tree.norm(by_flow)
-    share = list(weights.values())
-    total = jax.tree.map(lambda leaf: jnp.tensordot(jnp.asarray(share, leaf.dtype), leaf, axes=1), gradients)
+    logged = {**diagnostics, **values}
+    share = {name: jnp.asarray(weight, values[name].dtype) for name, weight in weights.items()}
+    if settings.term_norms:
+        # One batched pull-back of all terms: compiled once, however many there are.
+        names = list(weights)
+        chosen = {name: jnp.asarray([float(other == name) for other in names], share[name].dtype) for name in names}
+        (gradients,) = jax.vmap(pull)(chosen)
+        for number, name in enumerate(names):
+            by_tracer, by_flow = jax.tree.map(lambda leaf, n=number: leaf[n], gradients)
+            logged[f"gradient_norm/{name}"] = optax.tree.norm(by_tracer)
+            if flow is not None:
+                logged[f"gradient_norm/{name}/flow"] = optax.tree.norm(by_flow)
+        weighed = list(weights.values())
+        total = jax.tree.map(lambda leaf: jnp.tensordot(jnp.asarray(weighed, leaf.dtype), leaf, axes=1), gradients)
+    else:
+        (total,) = pull(share)
     logged["loss"] = sum((weight * values[name] for name, weight in weights.items()), start=jnp.zeros(()))
     return total, logged
 
