@@ -242,7 +242,8 @@ def test_coverage_by_log_dice_calls_a_lost_mask_back() -> None:
     agrees, valid, weight = (
         np.asarray(each[-1]) for each in eqx.filter_jit(future_agreement)(clip.camera, clip.frames, last)
     )
-    assert valid.all() and (agrees.sum((-2, -1)) > 1.0).all()
+    assert valid.all()
+    assert (agrees.sum((-2, -1)) > 1.0).all()
     share = np.random.default_rng(0).uniform(size=clip.frames.depth_m.shape[1:])
     seen = _masked(clip, share)
     dice = 2 * (share * agrees).sum((-2, -1)) / ((share**2).sum() + (agrees**2).sum((-2, -1)) + 1)
