@@ -11,16 +11,11 @@ from ...image.warp import gather
 from ...tracer import Frame
 from ._seen import ObjectiveSettings, Seen
 
-_LEAST_DICE = 1e-6
-"""Keeps the logarithm finite where mask and pixels have nothing in common."""
-
 
 def coverage(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """1 - Dice of the mask, made from the past, with the pixels whose motion in the coming window is the tag's; or - log Dice.
+    """1 - Dice of the mask, made from the past, with the pixels whose motion in the coming window is the tag's.
 
-    Keeps the mask from shrinking to a few sure pixels. Of a mask that has already lost what moves like the tag the
-    gradient of 1 - Dice is nearly 0, that of - log Dice is not: with `coverage_by="log_dice"` it finds back, and frames
-    in which no pixel moves like the tag say nothing. Nothing flows back into the pixels' future.
+    Keeps the mask from shrinking to a few sure pixels. Nothing flows back into the pixels' future.
     """
     del key
     agrees, valid, weight = future_agreement(seen.camera, seen.frames, settings)
@@ -31,11 +26,7 @@ def coverage(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Float
     dice = 2.0 * overlap / (size + 1.0)  # one pixel more keeps the gradient of a vanishing mask finite
     started = jnp.arange(num_asked) >= min(settings.skip_frames, num_asked - 1)
     weight = jnp.where(started[:, None], weight, 0.0)
-    lost = 1.0 - dice
-    if settings.coverage_by == "log_dice":
-        lost = -jnp.log(dice + _LEAST_DICE)
-        weight = jnp.where(jnp.sum(agrees, axis=(-2, -1)) > 1.0, weight, 0.0)
-    loss = safe_divide(jnp.sum(lost * weight), jnp.sum(weight))
+    loss = safe_divide(jnp.sum((1.0 - dice) * weight), jnp.sum(weight))
     return loss, {"mask_share": jnp.mean(seen.said.mask)}
 
 

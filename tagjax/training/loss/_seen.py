@@ -40,14 +40,11 @@ class ObjectiveSettings:
     max_reads: int = 384  # reads of one tag in a clip
     num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
     multiple: int = 1  # of the coherence: 2 takes phases modulo pi: right whether the reader flips or not, but ambiguous twice as soon
-    coverage_by: Literal["dice", "log_dice"] = "dice"  # the logarithm's gradient does not vanish with the mask
     future_alpha_m2: float = 1e-3  # a pixel agrees with the future if it is within about the root of this
     future_stride: int = 2  # every n-th working pixel is asked
     rematerialise: bool = True  # keep only the tracer's states for the backward pass
     memory: float = 0.5  # share of the gradient that a frame hands on to the frame before
-    term_norms: bool = (
-        False  # log how large each term's gradient is: each goes back by itself, three terms take 1.7 times the time
-    )
+    term_norms: bool = False  # log each term's gradient norm: each goes back by itself, three take 1.7 times the time
 
     def __post_init__(self) -> None:
         if not 0 < self.flip_share < 1:
