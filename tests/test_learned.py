@@ -70,7 +70,7 @@ def _changed(path: Path, **changes: Any) -> Path:
     return other
 
 
-@pytest.mark.parametrize("weights", ["default", "tagattention", "things_in_hand"])
+@pytest.mark.parametrize("weights", ["default", "tagattention"])
 def test_what_did_not_move_in_learning_may_be_asked_for(weights: str) -> None:
     """`tracer.rest_doubt=0.2` with packaged parameters, as docs/learning.md advises."""
     with initialize_config_dir(CONF, version_base="1.3"):
