@@ -84,6 +84,10 @@ def test_what_did_not_move_in_learning_may_be_asked_for(weights: str) -> None:
     told = with_doubt.physical()
     assert told.pop("rest_doubt") == pytest.approx(0.2)
     assert told == {name: value for name, value in without.physical().items() if name != "rest_doubt"}
+    with pytest.raises(
+        ValueError, match=r"things_in_hand\.json: learned from rest_doubt=0\.0.* but rest_doubt=0\.2 is asked for"
+    ):
+        make_tracer(doubting, "things_in_hand")  # which learned it
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
