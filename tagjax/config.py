@@ -35,24 +35,24 @@ class ClipSettings:
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
     estimator: Estimator = "robust"  # of the tags' distances
-    antennas: Antennas = None  # that distances are to: `all`, numbers from 1, or the one with the most reads if None
+    antennas: Antennas = None  # distances are to these: `all`, numbers from 1, or the one with the most reads if None
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
-    least_motion: float = 0.1  # training clips in which no tag is heard to move by so much are not drawn; 0 draws all
-    most_tags: int | None = None  # of a training clip: the one that moves most, others by chance; all if None
-    workers: int = 0  # processes that load training clips; with none a thread does
+    min_motion: float = 0.1  # training clips without a tag whose reads show so much motion are not drawn; 0 draws all
+    max_tags: int | None = None  # of a training clip: the tag that moves most, others at random; all if None
+    workers: int = 0  # processes that load training clips; with 0 a thread does
 
     def __post_init__(self) -> None:
         check_clip(stride=self.stride, window=self.window, max_reads=self.max_reads)
         if self.length < self.window:
             raise ConfigError(f"length is {self.length}; expected at least the window's {self.window} frames.")
-        if not 0 <= self.least_motion < 1:
-            raise ConfigError(f"least_motion is {self.least_motion}; expected a share of coherence, 0 to less than 1.")
-        if self.most_tags is not None and self.most_tags < 1:
-            raise ConfigError(f"most_tags is {self.most_tags}; expected at least 1 tag, or null for all.")
+        if not 0 <= self.min_motion < 1:
+            raise ConfigError(f"min_motion is {self.min_motion}; expected a loss of coherence, from 0 to less than 1.")
+        if self.max_tags is not None and self.max_tags < 1:
+            raise ConfigError(f"max_tags is {self.max_tags}; expected at least 1 tag, or null for all.")
 
     def arguments(self) -> dict[str, Any]:
-        """What `load_clip` and `clip_dataset` both take, by name."""
+        """The arguments that `load_clip` and `clip_dataset` both have, by name."""
         names = ("stride", "flow", "window", "max_reads", "estimator", "antennas")
         return {name: getattr(self, name) for name in names}
 
@@ -74,7 +74,7 @@ class SimulateSettings:
 
 @dataclasses.dataclass(frozen=True)
 class VirtualTagSettings:
-    """Virtual tags for recordings whose tracks are known: each label in turn, by itself, at the full read rate."""
+    """Virtual tags for recordings with known tracks: one tag on each label, each simulated alone at the full read rate."""
 
     tracks: str | None = None  # CSV: frame,person,x_m,y_m,z_m,range_m,visible
     labels: str | None = None  # folder of label masks NNNNNNNN.png
@@ -86,13 +86,13 @@ class VirtualTagSettings:
             raise ConfigError("seeds is empty; expected at least one: a reader and its noise are drawn for each.")
         if self.tracks is None and (self.labels, self.seeds, dict(self.reader)) != (None, (0,), {}):
             raise ConfigError(
-                "tracks is null, so there is no virtual tag; give tracks (a CSV file), or nothing of the rest."
+                "tracks is null, so there is no virtual tag; give tracks (a CSV file), or leave out labels, seeds and reader."
             )
 
 
 @dataclasses.dataclass(frozen=True)
 class DataSettings:
-    """What is trained on and what is held out. Without recordings, simulated ones are made."""
+    """Recordings for training and held-out ones. Without any, simulated ones are made."""
 
     recordings: tuple[str, ...] = ()
     validation: tuple[str, ...] = ()
@@ -103,7 +103,7 @@ class DataSettings:
 
 @dataclasses.dataclass(frozen=True)
 class JointSettings:
-    """A flow network that learns with the tracer."""
+    """A flow network that is learned with the tracer."""
 
     flow: Mapping[str, Any]
     optimizer: Mapping[str, Any]
@@ -116,22 +116,26 @@ class JointSettings:
         if self.weight < 0:
             raise ConfigError(f"weight is {self.weight}; expected 0 or more.")
         if self.loss.self_supervision > 0:
-            raise ConfigError("loss.self_supervision is of experiments.train_flow only; expected 0.")
+            raise ConfigError(
+                "loss.self_supervision is above 0, which only experiments.train_flow supports; expected 0."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """Everything of a training run."""
+    """All settings of a training run."""
 
     tracer: Mapping[str, Any]
     optimizer: Mapping[str, Any]
     weights: str | None = None  # learned parameters to begin with: `default`, a name, or a file (tagjax.learned)
     baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside it
-    baseline_estimators: Mapping[str, str] = dataclasses.field(default_factory=dict)  # where not the clips' own
+    baseline_estimators: Mapping[str, str] = dataclasses.field(
+        default_factory=dict
+    )  # of a baseline, where not the clips'
     seed: int = 0
     clip_norm: float = 1.0
-    resume: bool = True  # go on from the run folder's newest checkpoint, if it holds one
-    retune: bool = False  # then with another clip_norm or optimiser than it was begun with
+    resume: bool = True  # from the run folder's newest checkpoint, if it holds one
+    retune: bool = False  # a resumed run may have another clip_norm and other numbers of its optimiser
     joint: JointSettings | None = None  # without it flow is `data.clips.flow`, computed once
     data: DataSettings = dataclasses.field(default_factory=DataSettings)
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
@@ -143,7 +147,7 @@ class TrainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainFlowConfig:
-    """Everything of a run that trains a flow network."""
+    """All settings of a training run of a flow network."""
 
     flow: Mapping[str, Any]
     optimizer: Mapping[str, Any]
@@ -169,47 +173,51 @@ class TrainFlowConfig:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateConfig:
-    """Everything of an evaluation. What is None is taken from the run."""
+    """All settings of an evaluation. What is None is taken from the run, the weights, or the tracer's configuration."""
 
-    run: str | None = None  # a run folder of experiments.train; without it `tracer` is evaluated untrained
+    run: str | None = None  # a run folder of experiments.train
     checkpoint: int | None = None  # step; the newest if None
     tracer: Mapping[str, Any] | None = None
-    weights: str | None = None  # learned parameters of `tracer`: `default`, a name, or a file (tagjax.learned)
+    weights: str | None = (
+        None  # learned parameters: `default`, a name, or a file; they name their tracer if `tracer` is None
+    )
     recordings: tuple[str, ...] = ()
     epcs: tuple[str, ...] | None = None
-    stride: int | None = None
     frames: tuple[int, int] | None = None
-    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ClipSettings`
+    clips: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # in place of the run's, the weights' or the tracer's
     baselines: Mapping[str, Mapping[str, Any]] | None = None
     baseline_estimators: Mapping[str, str] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
-    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ScoreSettings`
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's
     progress: bool = True
 
     def __post_init__(self) -> None:
-        if self.stride is not None:
-            check_clip(stride=self.stride)
         changed(ClipSettings(), self.clips, where="clips")
         changed(ScoreSettings(), self.scores, where="scores")
         for name, other in (("tracer", self.tracer), ("weights", self.weights)):
             if self.run is not None and other is not None:
-                raise ConfigError(f"run={self.run} has a tracer and parameters of its own: leave out {name}=, or run=.")
+                raise ConfigError(
+                    f"found both run={self.run} and {name}=; expected one of them, because a run has its own tracer and parameters."
+                )
         if self.run is None and self.checkpoint is not None:
             raise ConfigError(
-                f"checkpoint={self.checkpoint} is one of a run's: give run=<folder of experiments.train>."
+                f"found checkpoint={self.checkpoint} without run; expected run=<folder of experiments.train> with it."
             )
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulateConfig:
-    """Which suite is simulated, and where to; `benchmark` is a suite's settings (`tagjax.sim.suites.Suite`)."""
+    """The suite that is simulated (settings of `tagjax.sim.suites.Suite`), and the folder for its recordings."""
 
-    benchmark: Mapping[str, Any]
-    out: str = "recordings/benchmark"
+    suite: Mapping[str, Any]
+    recordings_dir: str = "recordings"
     smoke: bool = False
-    workers: int | None = None
+    workers: int | None = None  # processes; as many as there are cores if None
     progress: bool = True
+    sheet: str | None = None  # a folder for a contact sheet; no recordings are then made
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
-            raise ConfigError(f"workers is {self.workers}; at least 1 process is needed.")
+            raise ConfigError(f"workers is {self.workers}; expected at least 1 process.")

@@ -62,11 +62,10 @@ def _adapter(schema: type) -> Any:  # a TypeAdapter, which the runtime type chec
 
 def _forbid_unknown_keys(hint: Any) -> None:
     """Set pydantic's option on every dataclass that a value of this type may hold: by itself it ignores unknown keys."""
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if "__pydantic_config__" not in vars(hint):
-            hint.__pydantic_config__ = _STRICT  # type: ignore[attr-defined]
-            for each in typing.get_type_hints(hint).values():
-                _forbid_unknown_keys(each)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type) and "__pydantic_config__" not in vars(hint):
+        hint.__pydantic_config__ = _STRICT  # type: ignore[attr-defined]
+        for each in typing.get_type_hints(hint).values():
+            _forbid_unknown_keys(each)
     for each in typing.get_args(hint):
         _forbid_unknown_keys(each)
 

@@ -9,8 +9,9 @@ from typing import Any
 
 from ..config import ClipSettings, ConfigError, DataSettings, EvaluateConfig, TrainConfig, changed, from_mapping
 from ..recording import Recording
+from ..tracer_settings import learned_tracer, make_tracer, tracer_clips
 from ..training.checkpoint import Checkpoints
-from ..training.run import evaluate_tracers, initial_state, make_tracer, own_flow
+from ..training.run import evaluate_tracers, initial_state, own_flow
 from ..training.sources import opened, training_recordings
 from ..training.state import TrainState
 from .evaluate import ScoreSettings
@@ -38,8 +39,9 @@ def run_evaluation(
 ) -> dict[str, Any]:
     """Evaluate and return the report's summary, which is also written to `folder`.
 
-    `run_values` is the configuration found in the run folder; what `config` leaves open is taken from it. Without
-    recordings the run's own held-out ones are used. Raises `ConfigError` where neither names a tracer or a recording.
+    `run_values` is the configuration found in the run folder. What `config` leaves open is taken from it, or else from the
+    file of learned parameters or the tracer's configuration. Without recordings the run's own held-out ones are used. Raises
+    `ConfigError` where nothing names a tracer or a recording.
     """
     clips, scores, baselines, recordings = ClipSettings(), ScoreSettings(), dict(config.baselines or {}), []
     estimators = dict(config.baseline_estimators or {})
@@ -56,18 +58,23 @@ def run_evaluation(
         estimators = dict(trained.baseline_estimators) | estimators
         if not config.recordings:
             recordings = held_out(trained.data)
+    elif config.weights is not None:
+        tracer, clips = learned_tracer(config.weights, config.tracer)
+        tracers = {"learned": tracer}
     elif config.tracer is not None:
-        name = "untrained" if config.weights is None else "learned"
-        tracers = {name: make_tracer(config.tracer, config.weights)}
+        tracers, clips = {"untrained": make_tracer(config.tracer)}, tracer_clips(config.tracer)
     else:
-        raise ConfigError("Nothing to evaluate: give run=<folder of experiments.train>, or tracer=<name> untrained.")
-    clips = changed(
-        clips, {**config.clips, **({} if config.stride is None else {"stride": config.stride})}, where="clips"
-    )
+        raise ConfigError(
+            "Nothing to evaluate: expected run=<folder of experiments.train>, weights=<default, a name or a file>, or "
+            "tracer=<name> for an untrained tracer."
+        )
+    clips = changed(clips, config.clips, where="clips")
     epcs = clips.epcs if config.epcs is None else config.epcs
     recordings += opened(config.recordings, config.virtual_tag)
     if not recordings:
-        raise ConfigError("No recording to evaluate on: give recordings=[a.zarr,...]; the run held none out.")
+        raise ConfigError(
+            "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with held-out recordings."
+        )
     tracers |= {name: make_tracer(settings) for name, settings in baselines.items()}
     return evaluate_tracers(
         tracers,

@@ -203,13 +203,13 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
             found = json.loads((home / MANIFEST).read_text())
         except (OSError, ValueError) as error:
             raise RecordingError(
-                f"{home} holds something else (no readable {MANIFEST}). Name another folder with out=."
+                f"{home} holds something else (no readable {MANIFEST}). Name another folder with paths.recordings_dir=."
             ) from error
         differs = {key for key in {*found, *manifest} if found.get(key) != manifest.get(key)}
         # A recording follows from its variant, split and number: more of them leave those there as they are.
         if differs - {"counts"}:
             raise RecordingError(
-                f"{home} holds this suite with other settings ({', '.join(sorted(differs))}). Name another folder with out=."
+                f"{home} holds this suite with other settings ({', '.join(sorted(differs))}). Name another folder with paths.recordings_dir=."
             )
     else:
         home.mkdir(parents=True)

@@ -11,12 +11,12 @@ from ...baselines._interface import host_trace
 from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate, load_calibration
 from ...baselines.tagview import TagviewSettings, TagviewTracer
 from ...baselines.tagvision import PlaneCamera, TagVision, TagVisionSettings
-from ...config import ClipSettings, ConfigError
+from ...config import ConfigError
 from ...data.store import open_recording
 from ...recording import Recording, RecordingError
 from ...sim.suites import Item
 from ...tracer import AbstractTracer, Trace
-from ...training.run import make_tracer
+from ...tracer_settings import make_tracer, tracer_clips
 from ...training.sources import clip_loader
 from ..evaluate import ScoreSettings, trace_recording
 from ..tagvision import CalibrationSettings, calibrated, table_truth
@@ -34,20 +34,14 @@ DEVICE = NAMES[:2]
 
 
 @dataclasses.dataclass(frozen=True)
-class TracerSettings:
-    """One way to set TagAttention: the tracer by `_target_`, and the clips that it sees."""
-
-    tracer: Mapping[str, Any]
-    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
-
-
-@dataclasses.dataclass(frozen=True)
 class SystemSettings:
     """The settings of every system. TagAttention has several, by name; which a suite takes follows from its story."""
 
-    tagattention: Mapping[str, TracerSettings] = dataclasses.field(default_factory=dict)
+    tagattention: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # as under conf/tracer
     settings_of: Mapping[str, str] = dataclasses.field(default_factory=dict)  # story to a name in `tagattention`
-    tagattention_paper: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # the tracer; clips as beside it
+    tagattention_paper: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # on the same clips as `tagattention`
     tagvision: TagVisionSettings = dataclasses.field(default_factory=TagVisionSettings)
     tagvision_calibration: CalibrationSettings = dataclasses.field(default_factory=CalibrationSettings)
     tagview: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
@@ -102,7 +96,7 @@ class Systems:
     def stride(self, name: str, item: Item) -> int:
         """Every how many pixels a system's masks have one."""
         way = self.chosen(name, item)
-        return 1 if way is None else self.settings.tagattention[way].clips.stride
+        return 1 if way is None else tracer_clips(self.settings.tagattention[way]).stride
 
     def traces(self, name: str, item: Item, recording: Recording, epcs: list[str]) -> Traces:
         """Frame numbers and traces. Raises `RecordingError` or `ValueError` where the method cannot apply."""
@@ -124,10 +118,11 @@ class Systems:
 
     def _device(self, name: str, way: str, recording: Recording, epcs: list[str]) -> Traces:
         settings, paper = self.settings.tagattention[way], name == "tagattention_paper"
-        clips = dataclasses.replace(settings.clips, estimator="paper") if paper else settings.clips
+        clips = tracer_clips(settings)
+        clips = dataclasses.replace(clips, estimator="paper") if paper else clips
         key = name, None if paper else way
         if key not in self._tracers:
-            self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings.tracer)
+            self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings)
         tracer = self._tracers[key]
         return trace_recording(tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.able(tracer))
 
@@ -158,7 +153,7 @@ class Systems:
             if grid is None or not Path(grid).exists():
                 raise RecordingError(
                     f"antennas not calibrated: systems.goller_grid names no recording of a tag grid ({grid}); "
-                    "`python -m experiments.simulate benchmark=shop_grid` makes one"
+                    "`python -m experiments.simulate suite=shop_grid` makes one"
                 )
             self._calibration = calibrate(open_recording(Path(grid)))
         return GollerTracer(self._calibration, self.settings.goller).at(recording)
