@@ -22,7 +22,7 @@ from tagjax.sim.world import STEP_S, tag_path
 pytestmark = pytest.mark.ci
 
 C = 299_792_458.0
-FOLDER = Path(__file__).parents[1] / "conf" / "benchmark"
+FOLDER = Path(__file__).parents[1] / "conf" / "suite"
 STILL_S = 20.0
 QUIET = {"outages_per_minute": 0.0}
 

@@ -1207,7 +1207,8 @@ def test_recordings_that_it_cannot_do_are_named(shop, calibration):
 
 def test_the_configuration_names_every_setting():
     with initialize_config_dir(str(Path(__file__).parents[1].resolve() / "conf"), version_base="1.3"):
-        values: Any = OmegaConf.to_container(compose("goller"))
+        values: Any = OmegaConf.to_container(compose("goller"), resolve=True)
+    values.pop("paths")
     config = from_mapping(GollerConfig, values)
     assert config.settings == GollerSettings()
     names = lambda kind: {field.name for field in dataclasses.fields(kind)}  # noqa: E731

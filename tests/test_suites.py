@@ -1,4 +1,4 @@
-"""Benchmark suites: every file under conf/benchmark is one, splits are apart, and runs resume and repeat exactly."""
+"""Suites: every file under conf/suite is one, splits are apart, and runs resume and repeat exactly."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tagjax.sim.visibility import seen_share, steps_every, stretches
 from tagjax.sim.world import STEP_S, tag_dipole, tag_path
 from tagjax.viz.contact_sheet import save_sheet
 
-FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
+FILES = sorted((Path(__file__).parents[1] / "conf" / "suite").glob("*.yaml"))
 
 
 def _suite(path: Path) -> Suite:
