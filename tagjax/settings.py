@@ -124,9 +124,10 @@ def _follow(location: Sequence[int | str], hint: Any, values: Any) -> tuple[tupl
             hint = arguments[0] if arguments[-1] is Ellipsis else arguments[min(int(step), len(arguments) - 1)]
         elif typing.get_args(inner):
             hint = typing.get_args(inner)[-1]
-        inside = isinstance(values, Mapping) and step in values
-        inside |= isinstance(values, list) and isinstance(step, int) and step < len(values)
-        values = values[step] if inside else None
+        if isinstance(values, list):
+            values = values[step] if isinstance(step, int) and step < len(values) else None
+        else:
+            values = values.get(step) if isinstance(values, Mapping) else None
     return tuple(path), hint, values
 
 
@@ -156,7 +157,8 @@ def _expected(hint: Any) -> str:
     if _is_union(hint):
         return " or ".join(_expected(one) for one in arguments)
     if origin is Literal:
-        return f"one of {', '.join(map(repr, arguments))}" if len(arguments) > 1 else repr(arguments[0])
+        choices = ", ".join(map(repr, arguments))
+        return f"one of {choices}" if len(arguments) > 1 else choices
     if origin is tuple:
         return f"a list of {_expected(arguments[0])}"
     if dataclasses.is_dataclass(hint) or (isinstance(origin, type) and issubclass(origin, Mapping)):

@@ -162,7 +162,9 @@ def test_packaged_parameters_need_no_further_setting(weights: str) -> None:
     named, same_clips = learned_tracer(weights, settings)
     assert isinstance(tracer, TagAttention)
     assert isinstance(named, TagAttention)
-    assert tracer.physical() == named.physical() == make_tracer(settings, weights).physical()
+    made = make_tracer(settings, weights)
+    assert isinstance(made, TagAttention)
+    assert tracer.physical() == named.physical() == made.physical()
     assert clips == same_clips == ClipSettings(stride=2)
     assert ClipSettings().stride == 4  # without weights
 

@@ -49,7 +49,9 @@ def test_a_wheel_has_one_package_at_its_top_level(wheel: Path) -> None:
     tops = {name.split("/")[0] for name in names}
     assert tops == {"tagjax", wheel.name.removesuffix("-py3-none-any.whl") + ".dist-info"}
     for folder in ("conf", "experiments"):
-        here = {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*") if path.suffix in (".yaml", ".py")}
+        here = {
+            path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*") if path.suffix in (".yaml", ".py")
+        }
         assert {f"tagjax/{name}" for name in here} <= names
 
 
@@ -57,7 +59,8 @@ def test_an_installed_wheel_runs_its_commands(wheel: Path, tmp_path: Path) -> No
     commands, packages = _environment(tmp_path / "environment")
     before = {path.name for path in packages.iterdir()}
     _run(
-        *(sys.executable, *PIP, "--python", commands / "python", "install", "--no-deps", "--no-index", wheel), cwd=tmp_path
+        *(sys.executable, *PIP, "--python", commands / "python", "install", "--no-deps", "--no-index", wheel),
+        cwd=tmp_path,
     )
     added = {path.name for path in packages.iterdir()} - before
     assert added == {"tagjax", wheel.name.removesuffix("-py3-none-any.whl") + ".dist-info"}
@@ -66,7 +69,9 @@ def test_an_installed_wheel_runs_its_commands(wheel: Path, tmp_path: Path) -> No
     assert scripts == {f"tagjax-{name.replace('_', '-')}" for name in entry_points}
     text = _run(commands / "tagjax-train", "--help", cwd=tmp_path)
     assert text.startswith("Train a tracer")
-    found = _run(commands / "python", "-c", "import tagjax, tagjax.experiments.train as t; print(t.__file__)", cwd=tmp_path)
+    found = _run(
+        commands / "python", "-c", "import tagjax, tagjax.experiments.train as t; print(t.__file__)", cwd=tmp_path
+    )
     assert Path(found.strip()) == packages / "tagjax" / "experiments" / "train.py"
     lines = _run(
         *(commands / "tagjax-evaluate-flow", "flows=[zero]", "num_pairs=1", "pairs.height=64", "pairs.width=64"),
