@@ -27,8 +27,9 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tagjax.config import from_mapping
-    from tagjax.evaluation.benchmark import BenchmarkSettings, machine, run_benchmark
+    from tagjax.benchmarks.stages import BenchmarkSettings, run_benchmark
+    from tagjax.core.machine import machine
+    from tagjax.core.settings import from_mapping
 
     console = Console(width=None if sys.stdout.isatty() else 140)  # a file has no width of its own
     timings = []

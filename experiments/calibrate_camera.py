@@ -21,7 +21,7 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
 
     from tagjax.baselines.tagvision import CalibrateSettings, calibrate_folder, write_calibration, write_corners
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
 
     values = resolved(config)
     if values["pictures"] is None:

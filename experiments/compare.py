@@ -37,9 +37,9 @@ def suites_named(names: str | list[str] | None) -> dict[str, Any]:
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.compare import CompareConfig, console_table, run_comparison
-    from tagjax.evaluation.report import plain
+    from tagjax.report.report import plain
 
     values = resolved(config)
     progress, names = values.pop("progress"), values.pop("suites")

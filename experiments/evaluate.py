@@ -42,9 +42,9 @@ def run_configuration(run: str | None) -> dict[str, Any] | None:
 def main(config: DictConfig) -> float:
     from rich.console import Console
 
-    from tagjax.config import EvaluateConfig, from_mapping
-    from tagjax.evaluation.report import plain, score_table
-    from tagjax.evaluation.run import run_evaluation
+    from tagjax.core.settings import from_mapping
+    from tagjax.evaluation.run import EvaluateConfig, run_evaluation
+    from tagjax.report.report import plain, score_table
 
     values = resolved(config)
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -23,9 +23,9 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> float:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.flow import FlowEvaluationSettings, evaluate_flows, flow_tables
-    from tagjax.evaluation.report import plain
+    from tagjax.report.report import plain
 
     values = resolved(config)
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -24,9 +24,9 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
-    from tagjax.data.store import open_recording
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.goller import GollerConfig, run_goller
+    from tagjax.recording.store import open_recording
 
     values = resolved(config)
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -19,8 +19,8 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
-    from tagjax.data.importers.settings import ImportSettings, import_recording
+    from tagjax.core.settings import from_mapping
+    from tagjax.recording.importers.settings import ImportSettings, import_recording
 
     console = Console(soft_wrap=True, highlight=False)
     with in_a_line("import_recording"):

@@ -27,9 +27,9 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> float:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
-    from tagjax.evaluation.report import plain
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.sweep import SweepConfig, run_sweep, table
+    from tagjax.report.report import plain
 
     from .progress import counting_bar
 

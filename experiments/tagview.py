@@ -27,7 +27,7 @@ def main(config: DictConfig) -> None:
     from rich.markdown import Markdown
     from rich.progress import Progress
 
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.tagview import TagviewExperiment, run_tagview, table, train_tagview
 
     values = resolved(config)

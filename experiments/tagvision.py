@@ -24,7 +24,7 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.tagvision import TagVisionExperiment, run_tagvision, table
 
     values = resolved(config)

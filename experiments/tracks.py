@@ -25,7 +25,7 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.tracks import TracksConfig, run_tracks
 
     values = resolved(config)

@@ -35,7 +35,8 @@ OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train")
 def main(config: DictConfig) -> float | None:
-    from tagjax.config import TrainConfig, from_mapping
+    from tagjax.core.settings import from_mapping
+    from tagjax.training.config import TrainConfig
     from tagjax.training.loop import DivergedError
     from tagjax.training.run import run_training
 

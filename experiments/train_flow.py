@@ -22,7 +22,8 @@ from .train import CONFIGS, resolved
 
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train_flow")
 def main(config: DictConfig) -> float | None:
-    from tagjax.config import TrainFlowConfig, from_mapping
+    from tagjax.core.settings import from_mapping
+    from tagjax.training.flow_config import TrainFlowConfig
     from tagjax.training.flow_run import run_flow_training
     from tagjax.training.loop import DivergedError
 

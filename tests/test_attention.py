@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tagjax.attention import att_corr, att_rbf, attention, centre_first
-from tagjax.propagation import (
+from tagjax.tagattention.attention import att_corr, att_rbf, attention, centre_first
+from tagjax.tagattention.propagation import (
     log_likelihood_ratio,
     propagate,
     radio_speed,

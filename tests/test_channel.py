@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.optimize import fminbound, minimize
 
-from tagjax.data.importers.clock import audit_clocks
-from tagjax.rf.noise import pi_flip_share
+from tagjax.radio.noise import pi_flip_share
+from tagjax.radio.reader import HOP_TABLES_HZ, ReaderState
+from tagjax.recording.importers.clock import audit_clocks
+from tagjax.recording.virtual_tags import Track
 from tagjax.sim import channel
 from tagjax.sim.channel import Environment, Planes, Scatterers, free_space, one_way_gain
 from tagjax.sim.inventory import InventorySettings, clock_stamps, draw_schedule, simulate_inventory
-from tagjax.sim.reader import HOP_TABLES_HZ, ReaderState
-from tagjax.sim.virtual_tag import Track
 
 C = 299_792_458.0
 F = 915.25e6

@@ -27,13 +27,13 @@ from tagjax.baselines.goller import (
     make_location,
     save_calibration,
 )
-from tagjax.config import ConfigError, from_mapping
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
 from tagjax.evaluation.compare._run import _score, _Tally
 from tagjax.evaluation.compare._table import bars, write_csv
+from tagjax.report.comparison import bar_plot
 from tagjax.sim.suites import Item, Suite, Variant
-from tagjax.tracer import Trace
-from tagjax.viz.comparison import bar_plot
+from tagjax.tracing.tracer import Trace
 
 CONF = Path(__file__).parents[1] / "conf"
 

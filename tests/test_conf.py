@@ -17,16 +17,19 @@ from omegaconf import OmegaConf
 
 from experiments.compare import suites_named
 from tagjax.baselines.tagview import MatchSettings
-from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
+from tagjax.core.settings import ConfigError, build, from_mapping
 from tagjax.evaluation.compare import SystemSettings
-from tagjax.evaluation.evaluate import ScoreSettings
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
+from tagjax.evaluation.run import EvaluateConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
+from tagjax.metrics.recordings import ScoreSettings
 from tagjax.sim.suites import PLANAR, Suite
 from tagjax.tagattention import TagAttention
-from tagjax.tracer import AbstractTracer
+from tagjax.tracing.tracer import AbstractTracer
+from tagjax.training.config import TrainConfig
+from tagjax.training.flow_config import TrainFlowConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 

@@ -10,11 +10,15 @@ import optax
 import pytest
 from omegaconf import OmegaConf
 
-from tagjax import config
-from tagjax.config import ConfigError, DataSettings, EvaluateConfig, TrainConfig, build, changed, from_mapping
-from tagjax.evaluation.evaluate import ScoreSettings
+from tagjax.core.settings import ConfigError, build, changed, from_mapping
+from tagjax.evaluation.run import EvaluateConfig
+from tagjax.metrics.recordings import ScoreSettings
+from tagjax.recording.opening import VirtualTagSettings
+from tagjax.tracing.clips import ClipSettings
+from tagjax.training.config import TrainConfig
 from tagjax.training.loop import LoopSettings
 from tagjax.training.loss import ObjectiveSettings
+from tagjax.training.sources import DataSettings, SimulateSettings
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -80,8 +84,8 @@ def test_build_makes_what_the_target_names() -> None:
     assert isinstance(build({"_target_": "optax.adam", "learning_rate": 0.1}), optax.GradientTransformation)
     nested = {"_target_": "optax.sgd", "learning_rate": {"_target_": "optax.constant_schedule", "value": 0.2}}
     assert isinstance(build(nested), optax.GradientTransformation)
-    resting = build({"_target_": "tagjax.config.ClipSettings", "stride": 2})
-    assert resting == config.ClipSettings(stride=2)
+    resting = build({"_target_": "tagjax.tracing.clips.ClipSettings", "stride": 2})
+    assert resting == ClipSettings(stride=2)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +95,7 @@ def test_build_makes_what_the_target_names() -> None:
         ("tagjaxevil.thing", "starts with tagjax. or optax."),
         ("tagjax.recording.dataclasses.asdict", "can be called"),
         ("tagjax.training.logging.os.system", "can be called"),
-        ("tagjax.config._resolve", "can be called"),
+        ("tagjax.core.settings._resolve", "can be called"),
         ("optax.adamm", "can be called"),
         ("tagjax.nothing.here", "can be called"),
         (None, "found None"),
@@ -107,7 +111,7 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
         build({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
 
 
-@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention_paper.TagAttentionPaper"])
+@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention.paper.TagAttentionPaper"])
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -135,12 +139,12 @@ def _written(path: str) -> dict[str, Any]:
     [
         ("objective/coherent.yaml", None, ObjectiveSettings),
         ("data/default.yaml", None, DataSettings),
-        ("data/default.yaml", "clips", config.ClipSettings),
-        ("data/default.yaml", "simulate", config.SimulateSettings),
-        ("data/default.yaml", "virtual_tag", config.VirtualTagSettings),
+        ("data/default.yaml", "clips", ClipSettings),
+        ("data/default.yaml", "simulate", SimulateSettings),
+        ("data/default.yaml", "virtual_tag", VirtualTagSettings),
         ("train.yaml", "scores", ScoreSettings),
         ("scores/default.yaml", None, ScoreSettings),
-        ("evaluate.yaml", "virtual_tag", config.VirtualTagSettings),
+        ("evaluate.yaml", "virtual_tag", VirtualTagSettings),
     ],
 )
 def test_defaults_in_code_are_those_of_the_files(path: str, section: str | None, schema: type) -> None:
@@ -154,11 +158,11 @@ def test_defaults_in_code_are_those_of_the_files(path: str, section: str | None,
 def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
     values = _written("evaluate.yaml")
     assert from_mapping(EvaluateConfig, {**values, "clips": {}, "scores": {}}) == EvaluateConfig()
-    for name, settings in (("clips", config.ClipSettings()), ("scores", ScoreSettings())):
+    for name, settings in (("clips", ClipSettings()), ("scores", ScoreSettings())):
         assert changed(settings, values[name], where=name) == settings
     assert set(values["scores"]) == {field.name for field in dataclasses.fields(ScoreSettings)}
     # A training clip's length, motion, tags and workers mean nothing to an evaluation, which has its own epcs.
-    assert set(values["clips"]) == {field.name for field in dataclasses.fields(config.ClipSettings)} - {
+    assert set(values["clips"]) == {field.name for field in dataclasses.fields(ClipSettings)} - {
         "length",
         "epcs",
         "least_motion",

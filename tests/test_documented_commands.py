@@ -17,10 +17,14 @@ from omegaconf import OmegaConf
 
 from experiments.benchmark import with_cases
 from experiments.compare import with_suites
-from tagjax.config import EvaluateConfig, SimulateConfig, TrainConfig, TrainFlowConfig, from_mapping
+from tagjax.core.settings import from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
+from tagjax.evaluation.run import EvaluateConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
+from tagjax.sim.suites import SimulateConfig
+from tagjax.training.config import TrainConfig
+from tagjax.training.flow_config import TrainFlowConfig
 
 ROOT = Path(__file__).parents[1]
 SCHEMAS: dict[str, type] = {

@@ -17,21 +17,15 @@ import pytest
 import synthetic_clips as synthetic
 from rich.console import Console
 
-from tagjax.evaluation.evaluate import (
-    ScoreSettings,
-    _tags,
-    box_to_picture,
-    evaluate_recording,
-    mask_to_picture,
-    score_traces,
-    trace_recording,
-)
-from tagjax.evaluation.metrics import box_iou, label_box
-from tagjax.evaluation.report import plain, score_table, summarise, write_report
+from tagjax.metrics.recordings import ScoreSettings, box_to_picture, evaluate_recording, mask_to_picture, score_traces
+from tagjax.metrics.tracking import box_iou, label_box
 from tagjax.recording import RecordingError
+from tagjax.report.overlay import MIN_WIDTH, _extent, _free_place
+from tagjax.report.report import plain, score_table, summarise, write_report
 from tagjax.tagattention import TagAttention
-from tagjax.tracer import Trace, describe, trace
-from tagjax.viz.overlay import MIN_WIDTH, _extent, _free_place
+from tagjax.tagattention.frame_trace import describe
+from tagjax.tracing.recordings import _tags, trace_recording
+from tagjax.tracing.tracer import Trace, trace
 
 EPCS = list(synthetic.EPCS)
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import yaml
 
-from tagjax.config import from_mapping
+from tagjax.core.settings import from_mapping
+from tagjax.radio.reader import HOP_TABLES_HZ
 from tagjax.recording import Recording
-from tagjax.sim.reader import HOP_TABLES_HZ
 from tagjax.sim.record import Filmed, film
 from tagjax.sim.suites import Suite, stage_item
 from tagjax.sim.world import STEP_S, tag_path

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tagjax.flow.opencv import make_flow
-from tagjax.geometry import (
+from tagjax.core.geometry import (
     backproject,
     crop_resize,
     depth_to_range,
@@ -18,6 +17,7 @@ from tagjax.geometry import (
     undistort,
     undistorted_positions,
 )
+from tagjax.flow.opencv import make_flow
 from tagjax.recording import Intrinsics
 
 CAMERA = Intrinsics(53.0, 54.0, 31.2, 24.1, 64, 48)

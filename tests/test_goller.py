@@ -55,8 +55,7 @@ from tagjax.baselines.goller._fit import true_states
 from tagjax.baselines.goller._reads import RssiFrames, grid_statistic, rssi_frames
 from tagjax.baselines.goller._site import level_site
 from tagjax.baselines.goller._system import Calibration, empty_picture
-from tagjax.config import from_mapping
-from tagjax.data.store import open_recording, save_recording
+from tagjax.core.settings import from_mapping
 from tagjax.evaluation.goller import (
     GollerConfig,
     follow,
@@ -71,6 +70,7 @@ from tagjax.evaluation.goller import (
 from tagjax.evaluation.goller._run import _handover_paths
 from tagjax.evaluation.goller._tables import interval
 from tagjax.recording import Intrinsics, Recording, RecordingError, TagReads, Truth
+from tagjax.recording.store import open_recording, save_recording
 
 RNG = np.random.default_rng(0)
 

@@ -14,9 +14,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax import learned
-from tagjax.learned import load_parameters, packaged_parameters, save_parameters
-from tagjax.tagattention import TagAttention
+from tagjax.tagattention import TagAttention, learned
+from tagjax.tagattention.learned import load_parameters, packaged_parameters, save_parameters
 from tagjax.training.run import make_tracer
 
 CONF = str((Path(__file__).parents[1] / "conf").resolve())
@@ -122,7 +121,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
 def test_a_tracer_without_learned_parameters_says_so() -> None:
     with pytest.raises(ValueError, match="learned parameters are of TagAttention"):
-        make_tracer({"_target_": "tagjax.tagattention_paper.TagAttentionPaper"}, "default")
+        make_tracer({"_target_": "tagjax.tagattention.paper.TagAttentionPaper"}, "default")
 
 
 def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:

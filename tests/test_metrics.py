@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tagjax.evaluation import metrics
-from tagjax.evaluation.metrics import FrameScores, MaskedMean, Scores
+from tagjax.metrics import tracking as metrics
+from tagjax.metrics.tracking import FrameScores, MaskedMean, Scores
 from tagjax.recording import Truth
 
 

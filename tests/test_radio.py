@@ -13,18 +13,25 @@ import pytest
 from radio_simulation import C, simulate_reads, smooth_path
 from scipy.interpolate import lagrange
 
+from tagjax.radio import refine, resample
+from tagjax.radio.channels import estimate_slope
+from tagjax.radio.coherence import coherence, phase_likelihood, phase_residual
+from tagjax.radio.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
+from tagjax.radio.noise import pi_flip_share, thermal_sigma_rad
+from tagjax.radio.phase import distance_to_phase, phase_to_distance
+from tagjax.radio.reads import PhaseReads
+from tagjax.radio.refine import interpolation_weights
+from tagjax.radio.unwrap import remove_jump, unwrap_paper
 from tagjax.recording import TagReads
-from tagjax.rf import refine, resample
-from tagjax.rf.channels import estimate_slope
-from tagjax.rf.coherence import coherence, phase_likelihood, phase_residual
-from tagjax.rf.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
-from tagjax.rf.noise import pi_flip_share, thermal_sigma_rad
-from tagjax.rf.phase import distance_to_phase, phase_to_distance
-from tagjax.rf.reads import PhaseReads
-from tagjax.rf.refine import interpolation_weights
-from tagjax.rf.rest import MIN_READS, coherence_lost
-from tagjax.rf.unwrap import remove_jump, unwrap_paper
-from tagjax.rf.windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
+from tagjax.tracing.motion_evidence import MIN_READS, coherence_lost
+from tagjax.tracing.range_windows import (
+    paper_windows,
+    phase_reads,
+    radio_model,
+    radio_windows,
+    robust_windows,
+    window_reads,
+)
 
 # Compiled whole: operation by operation they take several times as long to compile.
 refine_path = eqx.filter_jit(refine.refine_path)

@@ -13,16 +13,17 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import ClipSettings, ConfigError
-from tagjax.data.backwards import played_backwards
-from tagjax.data.clips import Clip, load_clip
-from tagjax.data.flow_cache import pair_flow
-from tagjax.data.store import open_recording
-from tagjax.evaluation.evaluate import ScoreSettings, trace_recording
+from tagjax.core.settings import ConfigError
+from tagjax.flow.cache import pair_flow
+from tagjax.metrics.recordings import ScoreSettings
 from tagjax.recording import Recording, RecordingError
+from tagjax.recording.backwards import played_backwards
+from tagjax.recording.store import open_recording
 from tagjax.tagattention import TagAttention
-from tagjax.tagattention_paper import TagAttentionPaper
-from tagjax.tracer import Camera, Frame, Later, Trace, trace
+from tagjax.tagattention.paper import TagAttentionPaper
+from tagjax.tracing.clips import Clip, ClipSettings, load_clip
+from tagjax.tracing.recordings import trace_recording
+from tagjax.tracing.tracer import Camera, Frame, Later, Trace, trace
 from tagjax.training.run import evaluate_tracers
 
 EPCS = list(synthetic.EPCS)

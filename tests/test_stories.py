@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tagjax.radio.coherence import coherence, phase_residual
 from tagjax.recording import Recording
-from tagjax.rf.coherence import coherence, phase_residual
 from tagjax.sim.objects import bounds
 from tagjax.sim.raycast import Stage, look_at
 from tagjax.sim.record import CaptureSettings, film

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import yaml
 
-from tagjax.config import ConfigError, from_mapping
-from tagjax.data.store import open_recording
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.recording import RecordingError
+from tagjax.recording.store import open_recording
 from tagjax.sim._shop import EXIT_X_M
+from tagjax.sim.contact_sheet import save_sheet
 from tagjax.sim.objects import bounds
 from tagjax.sim.planar import PlanarSettings, open_planar, planar_trials
 from tagjax.sim.raycast import Stage, look_at
@@ -26,7 +27,6 @@ from tagjax.sim.stories import STORIES
 from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, make_suite, prepare, stage_item
 from tagjax.sim.visibility import seen_share, steps_every, stretches
 from tagjax.sim.world import STEP_S, tag_dipole, tag_path
-from tagjax.viz.contact_sheet import save_sheet
 
 FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
 

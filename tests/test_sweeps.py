@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import ConfigError, from_mapping
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.sweep import Line, SweepConfig, read_lines, run_sweep, said, table, write_sweep
 from tagjax.tagattention import TagAttention
 from tagjax.training.logging import Logger, LoggerSettings
@@ -245,7 +245,7 @@ SUITE = {
     "counts": {"train": 0, "validation": 0, "test": 1},
     "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
 }
-PAPER = {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
+PAPER = {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
 
 
 def _config(folder: Path, **settings) -> SweepConfig:

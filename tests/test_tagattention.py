@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.data.clips import load_clip
-from tagjax.geometry import pixel_rays
-from tagjax.motion import empty_motion, push_gather, push_splat
+from tagjax.core.geometry import pixel_rays
+from tagjax.radio.reads import RadioWindow
 from tagjax.recording import Intrinsics
-from tagjax.rf.reads import RadioWindow
 from tagjax.tagattention import TagAttention, paper_limit
-from tagjax.tagattention_paper import FLOOR, TagAttentionPaper
-from tagjax.tracer import Camera, Frame, Later, describe, trace
+from tagjax.tagattention.frame_trace import describe
+from tagjax.tagattention.motion import empty_motion, push_gather, push_splat
+from tagjax.tagattention.paper import FLOOR, TagAttentionPaper
+from tagjax.tracing.clips import load_clip
+from tagjax.tracing.tracer import Camera, Frame, Later, trace
 
 
 def _learnable(**changed):

@@ -35,13 +35,8 @@ from tagjax.baselines.tagvision import (
     residuals_rad,
     theory_rad,
 )
-from tagjax.config import ConfigError, from_mapping
-from tagjax.evaluation.tagvision import (
-    LineSettings,
-    TagVisionExperiment,
-    line_scores,
-    run_tagvision,
-)
+from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.evaluation.tagvision import LineSettings, TagVisionExperiment, line_scores, run_tagvision
 
 C = 299_792_458.0
 SIGMA = 0.1 * np.sqrt(2.0)

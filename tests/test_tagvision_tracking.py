@@ -22,11 +22,8 @@ from tagjax.baselines.tagvision import (
     find_blobs,
     follow,
 )
-from tagjax.evaluation import evaluate
-from tagjax.evaluation.tagvision import (
-    PAPER_CAMERA,
-    overhead,
-)
+from tagjax.evaluation.tagvision import PAPER_CAMERA, overhead
+from tagjax.metrics import recordings as evaluate
 from tagjax.recording import Recording, RecordingError, TagReads
 
 QUICK = MatchSettings(num_rounds=20)

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tagjax.attention import coherent_score
-from tagjax.config import from_mapping
+from tagjax.core.settings import from_mapping
 from tagjax.evaluation.real_tags import (
     SCORES,
     align,
@@ -24,7 +23,6 @@ from tagjax.evaluation.real_tags import (
     speed_scores,
     speed_windows,
 )
-from tagjax.evaluation.tagged_walks import Speeds, Walk, load_tagged, load_uwb
 from tagjax.evaluation.tracks import (
     METHODS,
     Scene,
@@ -41,7 +39,9 @@ from tagjax.evaluation.tracks import (
     windows,
 )
 from tagjax.recording import RecordingError
-from tagjax.rf.windows import phase_reads
+from tagjax.recording.importers.tagged_walks import Speeds, Walk, load_tagged, load_uwb
+from tagjax.tagattention.attention import coherent_score
+from tagjax.tracing.range_windows import phase_reads
 
 RATE_HZ = 15.0
 

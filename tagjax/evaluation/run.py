@@ -7,13 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..config import ClipSettings, ConfigError, DataSettings, EvaluateConfig, TrainConfig, changed, from_mapping
+from ..core.settings import ConfigError, changed, from_mapping
+from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
+from ..recording.opening import VirtualTagSettings, opened
+from ..tracing.clips import ClipSettings, check_clip
 from ..training.checkpoint import Checkpoints
+from ..training.config import TrainConfig
 from ..training.run import evaluate_tracers, initial_state, make_tracer, own_flow
-from ..training.sources import opened, training_recordings
+from ..training.sources import DataSettings, training_recordings
 from ..training.state import TrainState
-from .evaluate import ScoreSettings
 
 
 def restore_state(run: Path, config: TrainConfig, *, step: int | None = None) -> TrainState:
@@ -81,3 +84,38 @@ def run_evaluation(
         frames=config.frames,
         progress=config.progress,
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateConfig:
+    """Everything of an evaluation. What is None is taken from the run."""
+
+    run: str | None = None  # a run folder of experiments.train; without it `tracer` is evaluated untrained
+    checkpoint: int | None = None  # step; the newest if None
+    tracer: Mapping[str, Any] | None = None
+    weights: str | None = (
+        None  # learned parameters of `tracer`: `default`, a name, or a file (tagjax.tagattention.learned)
+    )
+    recordings: tuple[str, ...] = ()
+    epcs: tuple[str, ...] | None = None
+    stride: int | None = None
+    frames: tuple[int, int] | None = None
+    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ClipSettings`
+    baselines: Mapping[str, Mapping[str, Any]] | None = None
+    baseline_estimators: Mapping[str, str] | None = None
+    virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ScoreSettings`
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if self.stride is not None:
+            check_clip(stride=self.stride)
+        changed(ClipSettings(), self.clips, where="clips")
+        changed(ScoreSettings(), self.scores, where="scores")
+        for name, other in (("tracer", self.tracer), ("weights", self.weights)):
+            if self.run is not None and other is not None:
+                raise ConfigError(f"run={self.run} has a tracer and parameters of its own: leave out {name}=, or run=.")
+        if self.run is None and self.checkpoint is not None:
+            raise ConfigError(
+                f"checkpoint={self.checkpoint} is one of a run's: give run=<folder of experiments.train>."
+            )

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from ..config import ClipSettings, ConfigError, from_mapping
-from ..data.store import open_recording
+from ..core.settings import ConfigError, from_mapping
+from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
+from ..recording.store import open_recording
+from ..report.report import plain
+from ..report.sweep import curve_panels, parameter_panels, worded
 from ..sim.suites import SPLITS, Item, Suite, make_items
+from ..tracing.clips import ClipSettings, clip_loader
 from ..training.run import make_tracer
-from ..training.sources import clip_loader
-from ..viz.sweep import curve_panels, parameter_panels, worded
-from .evaluate import RecordingResult, ScoreSettings, evaluate_recording
-from .report import plain
 
 _FEW = 6
 """Up to so many points have a line each; more are shown by parameter."""

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..radio.reader import ReaderSettings, ReaderState, channel_at
+from ..recording.virtual_tags import Track
 from ._rotation import unit
 from .channel import Environment, one_way_gain, reported_phase_rad, rssi_from_gain_dbm, two_way_gain
-from .reader import ReaderSettings, ReaderState, channel_at
-from .virtual_tag import Track
 
 REACH_EVERY_S = 0.1
 """Between looks at which tags an antenna hears: half a dwell."""

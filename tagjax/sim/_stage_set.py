@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..recording.virtual_tags import default_epc
 from ._crowd import is_free
 from ._rotation import turn_about
 from .inventory import InventorySettings
@@ -16,7 +17,6 @@ from .objects import ObjectModel, make_object
 from .people import Hands, PersonModel, PersonMotion, badge_m, hold, limb_bodies, make_person, move_person
 from .record import Filmed
 from .rooms import Room
-from .virtual_tag import default_epc
 from .world import Body, Poses, Tag, World
 
 UP = (0.0, 0.0, 1.0)

@@ -8,11 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ._rotation import turn_about
-from ._stage_set import (
-    UP,
-    StageSet,
-    fitted,
-)
+from ._stage_set import UP, StageSet, fitted
 from ._tunnels import tunnels
 from .motion import path_through
 from .objects import make_object

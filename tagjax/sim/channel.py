@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from .._numerics import SPEED_OF_LIGHT_M_S, safe_atan2, safe_divide, safe_norm, safe_sqrt, wrap_to_pi
-from .reader import RSSI_AT_1M_DBM
+from ..core.numerics import SPEED_OF_LIGHT_M_S, safe_atan2, safe_divide, safe_norm, safe_sqrt, wrap_to_pi
+from ..radio.reader import RSSI_AT_1M_DBM
 
 MIN_DISTANCE_M = 0.05
 """Amplitudes stop growing below this: lambda / (2 pi), where the far field of a UHF antenna begins."""

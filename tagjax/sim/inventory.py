@@ -12,13 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._numerics import SPEED_OF_LIGHT_M_S
-from ..recording import TagReads
-from ._links import SetUp
-from ._rotation import unit
-from ._rounds import ROUNDS_PER_ANTENNA, draw_schedule, in_outage
-from .channel import Environment
-from .reader import (
+from ..core.numerics import SPEED_OF_LIGHT_M_S
+from ..radio.reader import (
     DOPPLER_STD_HZ,
     DWELL_S,
     RSSI_AT_1M_DBM,
@@ -29,7 +24,12 @@ from .reader import (
     quantise_phase,
     quantise_rssi,
 )
-from .virtual_tag import Track
+from ..recording import TagReads
+from ..recording.virtual_tags import Track
+from ._links import SetUp
+from ._rotation import unit
+from ._rounds import ROUNDS_PER_ANTENNA, draw_schedule, in_outage
+from .channel import Environment
 
 RSSI_NOISE_DB_PER_RAD = 4.0
 """RSSI noise for each radian of phase noise (rail: 0.1 dB at -46 dBm, 0.3 to 0.4 dB at -62 to -68, quantised)."""

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..data.importers.clock import audit_clocks, to_host_ns
 from ..recording import ClockAudit, Intrinsics, Recording, TagReads, Truth
+from ..recording.importers.clock import audit_clocks, to_host_ns
+from ..recording.virtual_tags import Track
 from .channel import Environment, Planes, Scatterers
 from .flow_truth import flow_between
 from .inventory import InventorySettings, simulate_inventory
@@ -17,7 +18,6 @@ from .rooms import Panel
 from .sensors import SENSORS, frame_times, kinect_v2_intrinsics, xtion_intrinsics
 from .session import mask_boxes
 from .shading import ILLUMINATION, Shader, auto_exposure
-from .virtual_tag import Track
 from .visibility import steps_every
 from .world import STEP_S, World, tag_dipole, tag_path
 

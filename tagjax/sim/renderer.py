@@ -10,7 +10,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from ..geometry import pixel_rays
+from ..core.geometry import pixel_rays
 from ..recording import Intrinsics
 from .scene import Scene
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
+from ..radio.reader import ReaderSettings
 from ..recording import Intrinsics, Recording, TagReads, Truth
+from ..recording.virtual_tags import Track, attach_virtual_tags
 from .motion import chest
-from .reader import ReaderSettings
 from .renderer import Hits, cast, corner_camera, exact_flow, sense_depth, shade
 from .scene import build_scene
-from .virtual_tag import Track, attach_virtual_tags
 
 _SUBSTEPS_S = 0.01
 
@@ -116,7 +116,7 @@ def small_training_set(
     folder: str | Path, settings: SceneSettings | None = None, *, num_recordings: int = 3, seed: int = 0
 ) -> list[Path]:
     """Simulate recordings into `folder`, one Zarr each; those that are there already are kept."""
-    from ..data.store import save_recording
+    from ..recording.store import save_recording
 
     paths = []
     for number in range(num_recordings):

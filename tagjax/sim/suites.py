@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ..data.store import save_recording
 from ..recording import RecordingError
+from ..recording.store import save_recording
 from .inventory import InventorySettings
 from .planar import PlanarSettings, planar_trials, save_planar
 from .record import CaptureSettings, Filmed, film
@@ -276,3 +276,18 @@ def make_items(
 
     make_suite(suite, folder, workers=workers, on_done=on_done, wanted=wanted)
     return [item for item in suite.items() if wanted(item)]
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulateConfig:
+    """Which suite is simulated, and where to; `benchmark` is a suite's settings (`tagjax.sim.suites.Suite`)."""
+
+    benchmark: Mapping[str, Any]
+    out: str = "recordings/benchmark"
+    smoke: bool = False
+    workers: int | None = None
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ValueError(f"workers is {self.workers}; at least 1 process is needed.")

@@ -9,18 +9,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._numerics import safe_sqrt
-from ..anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
-from ..background import Background, empty_background, is_background, remember, shows_rest
-from ..common_fate import common_fate
-from ..motion import MotionMap, PlaceMap, carry, empty_motion, empty_places, push_gather, push_places
-from ..phase_memory import PhaseMemory, carry_phases
-from ..propagation import propagate, rival_log_odds, soft_clip
-from ..rf.reads import PhaseReads, RadioWindow
-from ..segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
-from ..tracer import Camera, Frame, Later, Trace, describe
-from ..view import Grouping, Ranging, View, elapsed_s, of_each_antenna, view_of
+from ..core.numerics import safe_sqrt
+from ..radio.reads import PhaseReads, RadioWindow
+from ..tracing.tracer import Camera, Frame, Later, Trace
 from ._evidence import AbstractEvidence
+from .anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
+from .background import Background, empty_background, is_background, remember, shows_rest
+from .common_fate import common_fate
+from .frame_trace import describe
+from .motion import MotionMap, PlaceMap, carry, empty_motion, empty_places, push_gather, push_places
+from .phase_memory import PhaseMemory, carry_phases
+from .propagation import propagate, rival_log_odds, soft_clip
+from .segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
+from .view import Grouping, Ranging, View, elapsed_s, of_each_antenna, view_of
 
 SIGNIFICANCE = 1e-3
 """Share of the pixels by which the histogram rises at a corner of its CDF."""

@@ -13,21 +13,23 @@ import optax
 from rich.console import Console
 from rich.progress import track
 
-from ..config import ClipSettings, ConfigError, TrainConfig, build
-from ..data.clips import Antennas, Clip, clip_dataset
-from ..evaluation.evaluate import RecordingResult, ScoreSettings, evaluate_recording
-from ..evaluation.report import plain, score_table, write_json, write_report
-from ..learned import load_parameters, save_parameters
+from ..core.settings import ConfigError, build
+from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
+from ..report.report import plain, score_table, write_json, write_report
 from ..tagattention import TagAttention
-from ..tracer import AbstractTracer
+from ..tagattention.learned import load_parameters, save_parameters
+from ..tracing.clips import Antennas, Clip, ClipSettings, clip_loader
+from ..tracing.tracer import AbstractTracer
 from .checkpoint import Checkpoints
+from .clip_dataset import clip_dataset
+from .config import TrainConfig
 from .flow_run import initial_network
 from .joint import JointModel, save_network
 from .logging import Logger
 from .loop import Trained, resumed, train
 from .processes import is_first, joined, share_of
-from .sources import clip_loader, training_recordings
+from .sources import training_recordings
 from .state import TrainState
 from .step import clip_loss, make_joint_optimizer, make_optimizer, train_step
 

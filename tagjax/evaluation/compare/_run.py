@@ -13,15 +13,15 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
-from ...config import ConfigError, from_mapping
-from ...data.store import open_recording
+from ...core.settings import ConfigError, from_mapping
+from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
+from ...metrics.tracking import Scores
 from ...recording import Recording, RecordingError
+from ...recording.store import open_recording
+from ...report.comparison import bar_plot
+from ...report.report import write_json
 from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_items
-from ...tracer import Trace
-from ...viz.comparison import bar_plot
-from ..evaluate import RecordingResult, ScoreSettings, score_traces
-from ..metrics import Scores
-from ..report import write_json
+from ...tracing.tracer import Trace
 from ._systems import NAMES, Systems, SystemSettings
 from ._table import LEGEND, MEASURES, SHORT, Cell, bars, markdown, said, write_csv
 

@@ -11,14 +11,15 @@ from ...baselines._interface import host_trace
 from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate, load_calibration
 from ...baselines.tagview import TagviewSettings, TagviewTracer
 from ...baselines.tagvision import PlaneCamera, TagVision, TagVisionSettings
-from ...config import ClipSettings, ConfigError
-from ...data.store import open_recording
+from ...core.settings import ConfigError
+from ...metrics.recordings import ScoreSettings
 from ...recording import Recording, RecordingError
+from ...recording.store import open_recording
 from ...sim.suites import Item
-from ...tracer import AbstractTracer, Trace
+from ...tracing.clips import ClipSettings, clip_loader
+from ...tracing.recordings import trace_recording
+from ...tracing.tracer import AbstractTracer, Trace
 from ...training.run import make_tracer
-from ...training.sources import clip_loader
-from ..evaluate import ScoreSettings, trace_recording
 from ..tagvision import CalibrationSettings, calibrated, table_truth
 
 Traces = Iterator[tuple[int, Trace]]
