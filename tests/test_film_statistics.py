@@ -1,4 +1,4 @@
-"""Filmed recordings of several suites, drawn small, against the tables measured on logs of real readers.
+"""Scenario recordings of several suites, drawn small, against the tables measured on logs of real readers.
 
 The tables: rail = an antenna on a rail (8 channels), counted = 1 to 25 tags before one antenna, hopping = 50 channels.
 """
@@ -15,9 +15,10 @@ import yaml
 from tagjax.config import from_mapping
 from tagjax.recording import Recording
 from tagjax.sim.reader import HOP_TABLES_HZ
-from tagjax.sim.record import Filmed, film
-from tagjax.sim.suites import Suite, stage_item
-from tagjax.sim.world import STEP_S, tag_path
+from tagjax.sim.record import simulate_recording
+from tagjax.sim.stories.scenario import Scenario
+from tagjax.sim.suites import Suite, item_scenario
+from tagjax.sim.world.bodies import STEP_S, tag_path
 
 pytestmark = pytest.mark.ci
 
@@ -27,31 +28,31 @@ STILL_S = 20.0
 QUIET = {"outages_per_minute": 0.0}
 
 
-def _stage(name: str, duration_s: float, **settings) -> Filmed:
+def _stage(name: str, duration_s: float, **settings) -> Scenario:
     """The world of a suite's first test recording, told for longer or shorter."""
     suite = from_mapping(Suite, yaml.safe_load((FOLDER / f"{name}.yaml").read_text()))
     suite = dataclasses.replace(suite, duration_s=duration_s, settings={**suite.settings, **settings})
-    return stage_item(next(item for item in suite.items() if item.split == "test"))
+    return item_scenario(next(item for item in suite.items() if item.split == "test"))
 
 
-def _film(filmed: Filmed, seed: int = 3, **inventory) -> Recording:
+def _film(scenario: Scenario, seed: int = 3, **inventory) -> Recording:
     """A frame every two seconds, 64 pixels wide; `inventory` replaces settings of the reader."""
-    settings = dataclasses.replace(filmed.inventory, **{**QUIET, **inventory})
+    settings = dataclasses.replace(scenario.inventory, **{**QUIET, **inventory})
     suite = from_mapping(Suite, yaml.safe_load((FOLDER / "multi_2.yaml").read_text()))
     capture = dataclasses.replace(suite.capture, width=64, frame_rate_hz=0.5)
-    return film(dataclasses.replace(filmed, inventory=settings), capture, seed=seed, name="statistics")
+    return simulate_recording(dataclasses.replace(scenario, inventory=settings), capture, seed=seed, name="statistics")
 
 
 @pytest.fixture(scope="module")
-def still_world() -> Filmed:
+def still_world() -> Scenario:
     """Twenty still tags in an office; for the first `STILL_S` nobody moves."""
-    return _stage("static_tags", 2.5 * STILL_S, still_s=STILL_S)
+    return _stage("static_tags", 2.5 * STILL_S, stationary_s=STILL_S)
 
 
 @pytest.fixture(scope="module")
 def still(still_world) -> Recording:
     """Read in a mode without pi flips, by a reader whose clock is off and drifts."""
-    return _film(still_world, flip_share=0.0, clock_offset_s=0.37, clock_drift_ppm=42.0)
+    return _film(still_world, flip_probability=0.0, clock_offset_s=0.37, clock_drift_ppm=42.0)
 
 
 @pytest.fixture(scope="module")
@@ -242,10 +243,10 @@ def test_the_clock_is_recovered(still):
 
 def test_corrected_times_fit_the_motion():
     """A waved tag's phase follows its path best where reads are late by the least latency, 5 ms."""
-    filmed = _stage("single_static", 8.0, speed_m_s=1.5)
-    recording = _film(filmed, flip_share=0.0)
+    scenario = _stage("single_static", 8.0, speed_m_s=1.5)
+    recording = _film(scenario, flip_probability=0.0)
     reads = recording.reads
-    path = np.linalg.norm(tag_path(filmed.world, filmed.world.tags[0]) - np.asarray(filmed.antennas_m[0]), axis=1)
+    path = np.linalg.norm(tag_path(scenario.world, scenario.world.tags[0]) - np.asarray(scenario.antennas_m[0]), axis=1)
     steps_s = np.arange(len(path)) * STEP_S
 
     def coherence(late_s: float) -> float:

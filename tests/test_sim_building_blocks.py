@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tagjax.sim import motion
-from tagjax.sim._crowd import BODY_RADIUS_M, distance_to
-from tagjax.sim._rotation import frame, multiply, quaternion_of, turn_about
-from tagjax.sim.objects import OBJECT_KINDS, bounds, make_object
-from tagjax.sim.people import Hands, carried, hand_path, hold, make_person, move_person, person_bodies
-from tagjax.sim.rooms import ROOMS, make_room
-from tagjax.sim.world import STEP_S, World, rotation_matrix
+from tagjax.sim.world import walks as motion
+from tagjax.sim.world.bodies import STEP_S, World, rotation_matrix
+from tagjax.sim.world.crowd import BODY_RADIUS_M, distance_to
+from tagjax.sim.world.objects import OBJECT_KINDS, bounds, make_object
+from tagjax.sim.world.people import Hands, carried, hand_path, hold, make_person, move_person, person_bodies
+from tagjax.sim.world.rooms import ROOMS, make_room
+from tagjax.sim.world.rotation import frame, multiply, quaternion_of, turn_about
 
 
 def straight(speed, length=6.0):

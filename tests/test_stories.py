@@ -10,14 +10,15 @@ import pytest
 
 from tagjax.recording import Recording
 from tagjax.rf.coherence import coherence, phase_residual
-from tagjax.sim.objects import bounds
-from tagjax.sim.raycast import Stage, look_at
-from tagjax.sim.record import CaptureSettings, film
-from tagjax.sim.sensors import kinect_v2_intrinsics
-from tagjax.sim.sightline import chord_m, is_free, line_of_sight
-from tagjax.sim.stories import STORIES, tell
-from tagjax.sim.visibility import seen_share, steps_every, stretches, surface_points
-from tagjax.sim.world import STEP_S, Material, Shape, rotation_matrix, tag_path
+from tagjax.sim.record import CaptureSettings, simulate_recording
+from tagjax.sim.rendering.raycast import Raycaster
+from tagjax.sim.rendering.sensors import kinect_v2_intrinsics
+from tagjax.sim.rendering.viewpoint import look_at
+from tagjax.sim.rendering.visibility import intervals, sampled_steps, surface_points, visible_fraction
+from tagjax.sim.stories import STORIES, build_scenario
+from tagjax.sim.world.bodies import STEP_S, Material, Shape, rotation_matrix, tag_path
+from tagjax.sim.world.objects import bounds
+from tagjax.sim.world.sightline import chord_m, is_free, line_of_sight
 
 PLAIN = Material((0.5, 0.5, 0.5))
 
@@ -28,34 +29,34 @@ SMALL = CaptureSettings(width=64, frame_rate_hz=5.0, jitter_s=0.0)
 
 
 def _tell(name: str, duration_s: float = 3.0, seed: int = 1, **settings):
-    return tell(name, np.random.default_rng(seed), duration_s, settings)
+    return build_scenario(name, np.random.default_rng(seed), duration_s, settings)
 
 
-def _object(filmed, number: int):
-    return filmed.world.bodies[filmed.world.tags[number].body]
+def _object(scenario, number: int):
+    return scenario.world.bodies[scenario.world.tags[number].body]
 
 
 @pytest.fixture(scope="module")
 def told():
-    return _tell("handheld", kinds=("box", "toy"), still_s=0.3)
+    return _tell("handheld", kinds=("box", "toy"), stationary_s=0.3)
 
 
 @pytest.fixture(scope="module")
 def two(told) -> Recording:
-    return film(told, dataclasses.replace(SMALL, flow=True), seed=7, name="two")
+    return simulate_recording(told, dataclasses.replace(SMALL, flow=True), seed=7, name="two")
 
 
 @pytest.mark.parametrize("name", STORIES)
 def test_every_story_is_a_world_that_can_be(name):
-    filmed = _tell(name, LONG_S.get(name, 3.0))
-    filmed.world.check()
-    epcs = [tag.epc for tag in filmed.world.tags]
+    scenario = _tell(name, LONG_S.get(name, 3.0))
+    scenario.world.check()
+    epcs = [tag.epc for tag in scenario.world.tags]
     assert epcs
     assert len(set(epcs)) == len(epcs)
-    named = {(body.name, body.label) for body in filmed.world.bodies if body.label}  # a person has many limbs
-    assert sorted(label for _, label in named) == list(range(1, len(filmed.world.names) + 1))
+    named = {(body.name, body.label) for body in scenario.world.bodies if body.label}  # a person has many limbs
+    assert sorted(label for _, label in named) == list(range(1, len(scenario.world.names) + 1))
     again = _tell(name, LONG_S.get(name, 3.0))
-    for one, other in zip(filmed.world.bodies, again.world.bodies, strict=True):
+    for one, other in zip(scenario.world.bodies, again.world.bodies, strict=True):
         np.testing.assert_array_equal(one.poses.position_m, other.poses.position_m)
 
 
@@ -67,13 +68,13 @@ def test_unknown_stories_and_settings_are_refused():
     with pytest.raises(ValueError, match="positive duration"):
         _tell("handheld", 0.0)
     with pytest.raises(ValueError, match="before one object"):
-        _tell("handheld", passing=True, kinds=("box", "toy"))
+        _tell("handheld", notebook_occluder=True, kinds=("box", "toy"))
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 2.5])
 def test_the_object_is_still_then_moves_as_fast_as_asked(speed_m_s):
-    filmed = _tell("handheld", 6.0, kinds=("bottle",), still_s=2.0, speed_m_s=speed_m_s)
-    path = _object(filmed, 0).poses.position_m
+    scenario = _tell("handheld", 6.0, kinds=("bottle",), stationary_s=2.0, speed_m_s=speed_m_s)
+    path = _object(scenario, 0).poses.position_m
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / STEP_S
     assert speed[: int(1.7 / STEP_S)].max() < 0.02
     # An arm that cannot reach as far as its wave goes is clamped, and then slower.
@@ -81,8 +82,8 @@ def test_the_object_is_still_then_moves_as_fast_as_asked(speed_m_s):
 
 
 def test_look_alikes_look_alike_and_others_do_not():
-    filmed = _tell("handheld", kinds=("bottle", "toy", "box", "bottle"), lookalikes=("bottle",))
-    one, other = _object(filmed, 0), _object(filmed, 3)
+    scenario = _tell("handheld", kinds=("bottle", "toy", "box", "bottle"), lookalikes=("bottle",))
+    one, other = _object(scenario, 0), _object(scenario, 3)
     assert one.name == other.name == "bottle"
     assert one.shapes == other.shapes
     plain = _tell("handheld", kinds=("bottle", "bottle"))
@@ -90,19 +91,19 @@ def test_look_alikes_look_alike_and_others_do_not():
 
 
 def test_objects_in_one_grip_are_one_rigid_thing():
-    filmed = _tell("handheld", kinds=("bottle", "box"), one_grip=True)
-    one, other = _object(filmed, 0).poses, _object(filmed, 1).poses
+    scenario = _tell("handheld", kinds=("bottle", "box"), one_grip=True)
+    one, other = _object(scenario, 0).poses, _object(scenario, 1).poses
     apart = np.einsum("tji,tj->ti", rotation_matrix(one.quaternion), other.position_m - one.position_m)
     np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-9)
     assert 0.03 < np.linalg.norm(apart[0]) < 0.4
 
 
 def test_a_handed_over_object_goes_from_one_to_the_other_without_a_jump():
-    filmed = _tell("handover", 6.0)
-    path = _object(filmed, 0).poses.position_m
+    scenario = _tell("handover", 6.0)
+    path = _object(scenario, 0).poses.position_m
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() / STEP_S < 4.0
     people = {}
-    for body in filmed.world.bodies:
+    for body in scenario.world.bodies:
         if body.role == "person":
             people.setdefault(body.name, []).append(body.poses.position_m)
     away = [np.linalg.norm(np.mean(parts, axis=0)[:, :2] - path[:, :2], axis=1) for parts in people.values()]
@@ -111,29 +112,29 @@ def test_a_handed_over_object_goes_from_one_to_the_other_without_a_jump():
 
 
 def test_what_is_put_down_stays_and_the_hand_goes():
-    filmed = _tell("put_down", 6.0)
-    path = _object(filmed, 0).poses.position_m
+    scenario = _tell("put_down", 6.0)
+    path = _object(scenario, 0).poses.position_m
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / STEP_S
     assert speed[:340].max() > 0.5
     assert speed.max() < 4.0
     np.testing.assert_array_equal(path[-1], path[380])
-    stand = next(body for body in filmed.world.bodies if body.name == "stand")
+    stand = next(body for body in scenario.world.bodies if body.name == "stand")
     # It stands on the stand: bottom on top.
-    bottom = path[-1, 2] - _half_height(filmed)
+    bottom = path[-1, 2] - _half_height(scenario)
     assert bottom == pytest.approx(2 * stand.shapes[0].size_m[2], abs=1e-6)
-    hands = [body.poses.position_m for body in filmed.world.bodies if body.role == "person"]
+    hands = [body.poses.position_m for body in scenario.world.bodies if body.role == "person"]
     nearest = np.min([np.linalg.norm(hand - path, axis=1) for hand in hands], axis=0)
     assert nearest[-1] > nearest[330] + 0.1
 
 
-def _half_height(filmed) -> float:
-    low, high = bounds(_object(filmed, 0).shapes)
+def _half_height(scenario) -> float:
+    low, high = bounds(_object(scenario, 0).shapes)
     return float(high[2] - low[2]) / 2
 
 
 def test_the_notebook_hides_the_object_and_lets_it_be_seen_again():
-    filmed = _tell("handheld", 6.0, kinds=("bottle",), passing=True)
-    seen = film(filmed, dataclasses.replace(SMALL, width=128), seed=1, name="passing")
+    scenario = _tell("handheld", 6.0, kinds=("bottle",), notebook_occluder=True)
+    seen = simulate_recording(scenario, dataclasses.replace(SMALL, width=128), seed=1, name="passing")
     assert seen.truth is not None
     area = np.sum(np.asarray(seen.truth.labels) == 1, axis=(1, 2))
     time_s = seen.frame_time_s()
@@ -145,19 +146,19 @@ def test_the_notebook_hides_the_object_and_lets_it_be_seen_again():
 
 
 def test_still_tags_are_read_but_not_labelled():
-    filmed = _tell("handheld", num_still_tags=5)
-    assert len(filmed.world.tags) == 6
-    labelled = [tag.epc for tag in filmed.world.tags if filmed.world.bodies[tag.body].label]
+    scenario = _tell("handheld", num_static_tags=5)
+    assert len(scenario.world.tags) == 6
+    labelled = [tag.epc for tag in scenario.world.tags if scenario.world.bodies[tag.body].label]
     assert len(labelled) == 1
-    recording = film(filmed, SMALL, seed=3, name="still")
+    recording = simulate_recording(scenario, SMALL, seed=3, name="still")
     assert recording.truth is not None
     assert set(recording.truth.tag_to_label) == set(labelled)
     assert len(recording.reads.epcs) >= 3  # far ones are too weak
 
 
 def test_tracks_are_as_far_apart_as_asked():
-    filmed = _tell("tabletop", num_objects=2, tracks="parallel", spacing_m=0.164)
-    one, other = (_object(filmed, number).poses.position_m for number in (0, 1))
+    scenario = _tell("tabletop", num_objects=2, tracks="parallel", spacing_m=0.164)
+    one, other = (_object(scenario, number).poses.position_m for number in (0, 1))
     np.testing.assert_allclose(np.abs(one[:, 0] - other[:, 0]), 0.164, atol=1e-9)
     np.testing.assert_allclose(one[:, 1], other[:, 1], atol=1e-9)
 
@@ -217,7 +218,9 @@ def test_reads_are_coherent_with_the_true_range_and_not_with_another(told, two):
 def test_a_film_without_shadows_has_none(told, shutter_s):
     capture = dataclasses.replace(SMALL, frame_rate_hz=1.0, shutter_s=shutter_s)
     dark, lit = (
-        film(told, dataclasses.replace(capture, shadows=shadows), seed=2, name="x", num_frames=2).colour[1]
+        simulate_recording(told, dataclasses.replace(capture, shadows=shadows), seed=2, name="x", num_frames=2).colour[
+            1
+        ]
         for shadows in (True, False)
     )
     assert np.mean(np.asarray(lit, float) - np.asarray(dark, float)) > 1.0
@@ -252,30 +255,30 @@ def test_surface_points_lie_on_the_surface(kind):
 
 def test_what_a_camera_sees_by_geometry_is_what_it_sees_by_rays():
     """A notebook passes before a bottle: the share in sight falls and rises with the pixels in its mask."""
-    filmed = _tell("handheld", 6.0, kinds=("bottle",), passing=True)
-    view = look_at(kinect_v2_intrinsics(256), filmed.camera_position_m, filmed.camera_look_at_m)
-    stage, looks = Stage(filmed.world), steps_every(filmed.world, 0.1)
-    share = seen_share(filmed.world, (filmed.world.tags[0].body,), view, looks)
+    scenario = _tell("handheld", 6.0, kinds=("bottle",), notebook_occluder=True)
+    view = look_at(kinect_v2_intrinsics(256), scenario.camera_position_m, scenario.camera_look_at_m)
+    raycaster, looks = Raycaster(scenario.world), sampled_steps(scenario.world, 0.1)
+    share = visible_fraction(scenario.world, (scenario.world.tags[0].body,), view, looks)
     area = []
     for step in looks:
-        stage.pose(int(step))
-        area.append(np.sum(stage.labels(stage.cast(view)) == 1))
+        raycaster.pose(int(step))
+        area.append(np.sum(raycaster.labels(raycaster.cast(view)) == 1))
     area = np.array(area)
-    assert looks[-1] == filmed.world.num_steps - 1
+    assert looks[-1] == scenario.world.num_steps - 1
     assert np.all(area[share == 0] <= 2)
     assert np.all(area[share > 0.5] > 10)
     assert np.corrcoef(share, area)[0, 1] > 0.8
     # Turned to either side, up, down or round, the camera has it no longer in its picture.
-    toward = np.mean(filmed.world.bodies[filmed.world.tags[0].body].poses.position_m[:20], axis=0) - view.position_m
+    toward = np.mean(scenario.world.bodies[scenario.world.tags[0].body].poses.position_m[:20], axis=0) - view.position_m
     course, fall = np.arctan2(toward[1], toward[0]), np.arctan2(-toward[2], np.hypot(toward[0], toward[1]))
     for aside, down in ((0.0, 0.0), (0.9, 0.0), (-0.9, 0.0), (0.0, 0.8), (0.0, -0.8), (np.pi, -2 * fall)):
         yaw, dip = course + aside, fall + down
         ahead = np.array([np.cos(yaw) * np.cos(dip), np.sin(yaw) * np.cos(dip), -np.sin(dip)])
         turned = look_at(kinect_v2_intrinsics(256), view.position_m, view.position_m + ahead)
-        seen = seen_share(filmed.world, (filmed.world.tags[0].body,), turned, looks[:3])
+        seen = visible_fraction(scenario.world, (scenario.world.tags[0].body,), turned, looks[:3])
         assert seen.all() if aside == down == 0 else not seen.any()
-    np.testing.assert_array_equal(stretches(np.array([1, 1, 0, 1, 0, 0, 1], bool)), [[0, 2], [3, 4], [6, 7]])
-    assert len(stretches(np.zeros(4, bool))) == 0
+    np.testing.assert_array_equal(intervals(np.array([1, 1, 0, 1, 0, 0, 1], bool)), [[0, 2], [3, 4], [6, 7]])
+    assert len(intervals(np.zeros(4, bool))) == 0
 
 
 def test_trains_that_cannot_be_hidden_so_often_are_refused():
@@ -288,9 +291,9 @@ def test_trains_that_cannot_be_hidden_so_often_are_refused():
 
 
 def test_still_tags_lie_near_the_antenna():
-    filmed = _tell("handheld", room="office", num_still_tags=12)
-    antenna = np.array(filmed.antennas_m[0])
-    away = [np.linalg.norm(tag_path(filmed.world, tag)[0] - antenna) for tag in filmed.world.tags[1:]]
+    scenario = _tell("handheld", room="office", num_static_tags=12)
+    antenna = np.array(scenario.antennas_m[0])
+    away = [np.linalg.norm(tag_path(scenario.world, tag)[0] - antenna) for tag in scenario.world.tags[1:]]
     assert max(away) < 5.2
 
 
@@ -298,18 +301,18 @@ def test_ceiling_antennas_look_down():
     shop, meeting = _tell("shop_exit"), _tell("handheld")
     np.testing.assert_array_equal(shop.antenna_axes, [[0.0, 0.0, -1.0]] * 3)
     assert meeting.antenna_axes is None
-    reads = film(shop, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="down").reads
+    reads = simulate_recording(shop, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="down").reads
     up = dataclasses.replace(shop, antenna_axes=((0.0, 0.0, 1.0),) * 3)
-    fewer = film(up, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="up").reads
+    fewer = simulate_recording(up, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="up").reads
     assert fewer.num_reads < 0.7 * reads.num_reads
 
 
 def test_the_same_seed_films_the_same_bytes():
-    one, other = (film(_tell("tabletop", 1.0), SMALL, seed=5, name="x") for _ in range(2))
+    one, other = (simulate_recording(_tell("tabletop", 1.0), SMALL, seed=5, name="x") for _ in range(2))
     np.testing.assert_array_equal(one.colour, other.colour)
     np.testing.assert_array_equal(one.depth, other.depth)
     np.testing.assert_array_equal(one.reads.phase_rad, other.reads.phase_rad)
-    another = film(_tell("tabletop", 1.0), SMALL, seed=6, name="x")
+    another = simulate_recording(_tell("tabletop", 1.0), SMALL, seed=6, name="x")
     assert not np.array_equal(one.colour, another.colour)
 
 
@@ -327,11 +330,11 @@ def test_two_objects_in_one_place_are_refused(told):
 
 
 def test_impossible_films_are_refused():
-    filmed = _tell("tabletop", 1.0)
+    scenario = _tell("tabletop", 1.0)
     with pytest.raises(ValueError, match="500 frames asked for; the world lasts for 6"):
-        film(filmed, SMALL, seed=1, name="x", num_frames=500)
+        simulate_recording(scenario, SMALL, seed=1, name="x", num_frames=500)
     with pytest.raises(ValueError, match="0 frames asked for"):
-        film(filmed, SMALL, seed=1, name="x", num_frames=0)
+        simulate_recording(scenario, SMALL, seed=1, name="x", num_frames=0)
     with pytest.raises(ValueError, match="Unknown sensor 'lidar'; known are kinect_v2"):
         CaptureSettings(sensor="lidar")
     with pytest.raises(ValueError, match="Unknown illumination"):

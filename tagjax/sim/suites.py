@@ -18,10 +18,11 @@ import numpy as np
 
 from ..data.store import save_recording
 from ..recording import RecordingError
-from .inventory import InventorySettings
-from .planar import PlanarSettings, planar_trials, save_planar
-from .record import CaptureSettings, Filmed, film
-from .stories import STORIES, tell
+from .radio.inventory import InventorySettings
+from .radio.planar import PlanarSettings, planar_trials, save_planar
+from .record import CaptureSettings, simulate_recording
+from .stories import STORIES, build_scenario
+from .stories.scenario import Scenario
 
 SPLITS = ("train", "validation", "test")
 
@@ -105,7 +106,7 @@ class Suite:
         """
         rate_hz = (num_frames - 0.9) / self.duration_s
         width = min(self.capture.width or 384, 384)
-        capture = dataclasses.replace(self.capture, width=width, frame_rate_hz=rate_hz, drop_share=0.0)
+        capture = dataclasses.replace(self.capture, width=width, frame_rate_hz=rate_hz, drop_probability=0.0)
         return dataclasses.replace(
             self, capture=capture, counts=Counts(0, 0, 1) if self.counts.test else Counts(1, 0, 0)
         )
@@ -149,7 +150,7 @@ class Made:
     elapsed_s: float
 
 
-def stage_item(item: Item) -> Filmed:
+def item_scenario(item: Item) -> Scenario:
     """The world of a recording: the first of a few draws in which everything finds its place.
 
     Raises `ValueError` with the last draw's reason if none does.
@@ -159,16 +160,16 @@ def stage_item(item: Item) -> Filmed:
     for draw in range(_DRAWS):
         try:
             rng = np.random.default_rng([item.seed, draw])
-            filmed = tell(variant.story or suite.story, rng, suite.duration_s, settings)
-            filmed.world.check()
-            filmed = dataclasses.replace(filmed, inventory=dataclasses.replace(filmed.inventory, **reader))
+            scenario = build_scenario(variant.story or suite.story, rng, suite.duration_s, settings)
+            scenario.world.check()
+            scenario = dataclasses.replace(scenario, inventory=dataclasses.replace(scenario.inventory, **reader))
         except ValueError as error:
             if draw == _DRAWS - 1:
                 raise ValueError(
                     f"{item.name} (seed {item.seed}), {_DRAWS} draws in vain; the last: {error}"
                 ) from error
         else:
-            return filmed
+            return scenario
     raise AssertionError("a draw returns or raises")
 
 
@@ -185,7 +186,7 @@ def make_item(item: Item, folder: Path) -> Made:
         os.replace(partial, path)
         return Made(item.name, 0, time.perf_counter() - start)
     capture = dataclasses.replace(item.suite.capture, **item.variant.capture)
-    recording = film(stage_item(item), capture, seed=item.seed, name=item.name)
+    recording = simulate_recording(item_scenario(item), capture, seed=item.seed, name=item.name)
     save_recording(recording, path)
     return Made(item.name, recording.num_frames, time.perf_counter() - start)
 

@@ -26,7 +26,7 @@ from ..data.picture_pairs import (
 from ..data.prepared import made_once, write_rows
 from ..data.stream import Stream
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
-from ..sim.textures import PHOTOGRAPHS, photograph
+from ..sim.rendering.textures import PHOTOGRAPHS, photograph
 from .flow_teacher import cut_pairs, taught_flow
 
 _BATCH = 16

@@ -1,0 +1,220 @@
+"""What stories share: a world in the making, places to stand, hands that wave, people and things around."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from ..radio.inventory import InventorySettings
+from ..virtual_tag import default_epc
+from ..world.bodies import Body, Poses, Tag, World
+from ..world.crowd import is_free
+from ..world.figure import PersonModel
+from ..world.objects import ObjectModel, make_object
+from ..world.people import Hands, PersonMotion, badge_m, hold, limb_bodies, make_person, move_person
+from ..world.rooms import Room
+from ..world.rotation import turn_about
+from ..world.trajectory import num_steps, still_then_move, wave
+from ..world.walks import Walk, random_walks, walk_along
+from .scenario import Scenario
+
+UP = (0.0, 0.0, 1.0)
+
+HAND_M = (0.36, 0.27, 1.12)  # where a hand is held before the body: ahead, to the side, above the floor
+
+
+Badge = Literal["level", "upright"]
+"""How the dipole of a badge lies on the chest: across it, or along the body."""
+
+_BADGE_DIPOLES: dict[Badge, tuple[float, float, float]] = {"level": (0.0, 1.0, 0.0), "upright": (0.0, 0.0, 1.0)}
+
+
+class ScenarioBuilder:
+    """Bodies, tags and labels of a world in the making."""
+
+    def __init__(self, room: Room, duration_s: float):
+        self.room, self.steps = room, num_steps(duration_s)
+        self.bodies: list[Body] = list(room.bodies)
+        self.tags: list[Tag] = []
+        self.names: dict[int, str] = {}
+
+    def person(self, model: PersonModel, walk: Walk, hands: Hands, *, badge: Badge | None = None) -> PersonMotion:
+        """Add a person on a walk. Returns the motion, with the hands' real positions.
+
+        With a `badge` the person wears a tag on the chest and has a label: the person is what is to be tracked.
+        """
+        number = len({body.name for body in self.bodies if body.role == "person"})
+        name, motion = f"person {number + 1}", move_person(model, walk, hands)
+        label = 0 if badge is None else len(self.names) + 1
+        limbs = limb_bodies(model, motion, label=label, name=name)
+        if badge is not None:
+            self.names[label] = name
+            torso = len(self.bodies) + list(motion.limbs).index("torso")
+            self.tags.append(Tag(default_epc(len(self.tags) + 1), torso, badge_m(model), _BADGE_DIPOLES[badge]))
+        self.bodies += limbs
+        return motion
+
+    def object(self, model: ObjectModel, poses: Poses, *, tagged: bool = True, labelled: bool = True) -> None:
+        label = len(self.names) + 1 if labelled else 0
+        if labelled:
+            self.names[label] = model.name
+        self.bodies.append(Body(model.name, model.shapes, poses, "object", label))
+        if tagged:
+            self.tags.append(Tag(default_epc(len(self.tags) + 1), len(self.bodies) - 1, model.tag_m, model.dipole))
+
+    def inside(self, path_m: np.ndarray) -> np.ndarray:
+        """A hand's path kept off the walls: who walks along a wall does not reach through it."""
+        length, width, _ = self.room.size_m
+        low, high = np.array([0.0, 0.3 - width / 2, 0.0]), np.array([length - 0.3, width / 2 - 0.3, np.inf])
+        return np.clip(path_m, low, high)
+
+    def scenario(
+        self, note: str, *, look_at_m: Sequence[float] | None = None, num_antennas: int = 1, **inventory: Any
+    ) -> Scenario:
+        room = self.room
+        if not 1 <= num_antennas <= len(room.antennas_m):
+            raise ValueError(
+                f"{num_antennas} antennas asked for; the {room.name} has places for {len(room.antennas_m)}."
+            )
+        world = World(
+            bodies=tuple(self.bodies),
+            tags=tuple(self.tags),
+            num_steps=self.steps,
+            size_m=room.size_m,
+            lights=room.lights,
+            ambient=room.ambient,
+            names=self.names,
+            note=note,
+        )
+        x, y, z = room.camera_look_at_m if look_at_m is None else look_at_m
+        return Scenario(
+            world,
+            room.camera_position_m,
+            (float(x), float(y), float(z)),
+            room.antennas_m[:num_antennas],
+            room.panels,
+            InventorySettings(**inventory),
+            None if room.antenna_axes is None else room.antenna_axes[:num_antennas],
+        )
+
+
+def standing(place: tuple[float, float], heading_rad: float, steps: int) -> Walk:
+    """A walk that never leaves its place (x, y)."""
+    return walk_along(np.broadcast_to(np.array(place), (steps, 2)), heading_rad)
+
+
+def facing_towards(place: Sequence[float], other: Sequence[float]) -> float:
+    """Heading from a place on the floor towards another, radians."""
+    return float(np.arctan2(other[1] - place[1], other[0] - place[0]))
+
+
+def resting(model: ObjectModel, place: Sequence[float], yaw_rad: float = 0.0) -> Poses:
+    """An object that stands at a place: x, y, and the height of what is below it."""
+    x, y, z = place
+    return Poses.fixed((x, y, z + model.half_size_m[2]), turn_about(UP, yaw_rad))
+
+
+def waved_hand(
+    walk: Walk, side: int, rng: np.random.Generator, duration_s: float, speed_m_s: float, stationary_s: float
+) -> np.ndarray:
+    """World path of a hand that is still before the body, then waves at random with the given peak speed."""
+    offset = (HAND_M[0], side * HAND_M[1], HAND_M[2] + float(rng.uniform(-0.05, 0.1)))
+    start = hold(walk, offset)
+    stationary_s = min(stationary_s, 0.4 * duration_s)
+    moving = duration_s - stationary_s
+    # An arm that stays in front of the body reaches about 0.3 m around; faster waves need harder pushes.
+    push = max(12.0, 5.5 * speed_m_s**2)
+    path = wave("random", (0.0, 0.0, 0.0), moving, peak_speed_m_s=speed_m_s, max_acceleration_m_s2=push, rng=rng)
+    offsets = still_then_move(path, stationary_s, duration_s)
+    return start + fitted(offsets, len(start))
+
+
+def ease(share: np.ndarray) -> np.ndarray:
+    """0 to 1 with the first derivative zero at both ends; gentler in the middle than `smooth_step`."""
+    return share * share * (3 - 2 * share)
+
+
+def fitted(path: np.ndarray, steps: int) -> np.ndarray:
+    """The path cut, or its end held, to a number of steps."""
+    return path[np.minimum(np.arange(steps), len(path) - 1)]
+
+
+def standing_places(
+    room: Room, rng: np.random.Generator, count: int, distance_m: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Places (x, y) beside each other before the camera, clear of furniture."""
+    camera = np.array(room.camera_position_m[:2])
+    for _ in range(2000):
+        away = rng.uniform(*distance_m)
+        gap = 1.15
+        middle = rng.uniform(-0.4, 0.4)
+        places = [(camera[0] + away, camera[1] + middle + gap * (k - (count - 1) / 2)) for k in range(count)]
+        if all(is_clear(room, place) for place in places):
+            return places
+    raise ValueError(f"No place for {count} people {distance_m} m before the camera of the {room.name}.")
+
+
+def is_clear(room: Room, place: tuple[float, float]) -> bool:
+    """Whether somebody can stand there: as walkers, or up to 0.2 m nearer to the camera."""
+    x0, y0, x1, y1 = room.walk_area_m
+    return is_free(np.asarray(place), (x0 - 0.2, y0, x1, y1), room.obstacles_m, 0.35)
+
+
+def add_walkers(
+    builder: ScenarioBuilder,
+    rng: np.random.Generator,
+    count: int,
+    duration_s: float,
+    taken: Sequence[tuple[float, float]],
+) -> None:
+    """People with empty hands who walk behind those who stand."""
+    if not count:
+        return
+    room = builder.room
+    x0, y0, x1, y1 = room.walk_area_m
+    behind = max((place[0] for place in taken), default=x0) + 0.7
+    walks = random_walks(
+        count, duration_s, rng, area_m=(min(behind, x1 - 1.2), y0, x1, y1), obstacles_m=room.obstacles_m
+    )
+    for walk in walks:
+        builder.person(make_person(rng), trimmed(walk, builder.steps), Hands())
+
+
+def trimmed(walk: Walk, steps: int) -> Walk:
+    """The walk cut, or its end held, to a number of steps."""
+    index = np.minimum(np.arange(steps), len(walk.heading_rad) - 1)
+    return Walk(*(getattr(walk, field.name)[index] for field in dataclasses.fields(walk)))
+
+
+def add_static_tags(
+    builder: ScenarioBuilder, rng: np.random.Generator, count: int, *, within_m: float = np.inf
+) -> None:
+    """Small tagged things that lie on tables, shelves and the floor; they are not labelled.
+
+    Each at the first of a few places that is `within_m` from the first antenna, or at the last of them.
+    """
+    antenna = np.array(builder.room.antennas_m[0])
+    for _ in range(count):
+        model = make_object(str(rng.choice(["book", "mug", "box"])), rng, scale=0.8)
+        place = _resting_place(builder.room, rng)
+        for _ in range(_PLACES):
+            if np.linalg.norm(np.array(place) - antenna) <= within_m:
+                break
+            place = _resting_place(builder.room, rng)
+        builder.object(model, resting(model, place, rng.uniform(0, 2 * np.pi)), labelled=False)
+
+
+_PLACES = 30
+
+
+def _resting_place(room: Room, rng: np.random.Generator) -> tuple[float, float, float]:
+    """On a table or a shelf, mostly, or on the floor."""
+    tables = room.tables
+    if tables and rng.random() < 0.8:
+        table = tables[int(rng.integers(len(tables)))]
+        x0, y0, x1, y1 = table.top_m
+        return rng.uniform(x0 + 0.05, x1 - 0.05), rng.uniform(y0 + 0.05, y1 - 0.05), table.height_m
+    return (*room.free_place(rng), 0.0)
