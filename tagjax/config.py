@@ -65,21 +65,6 @@ class ClipSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class SimulateSettings:
-    """The simulated recordings used where none are named; made once and kept under `folder`."""
-
-    num_recordings: int = 3
-    num_frames: int = 90
-    width: int = 320
-    height: int = 240
-    frame_rate_hz: float = 10.0
-    num_people: int = 3
-    seed: int = 0
-    validation_seed: int = 1000
-    folder: str = "recordings"
-
-
-@dataclasses.dataclass(frozen=True)
 class VirtualTagSettings:
     """Virtual tags for recordings whose tracks are known: each label in turn, by itself, at the full read rate."""
 
@@ -99,12 +84,13 @@ class VirtualTagSettings:
 
 @dataclasses.dataclass(frozen=True)
 class DataSettings:
-    """What is trained on and what is held out. Without recordings, simulated ones are made."""
+    """Training and validation recordings: those named, or the train and validation split of a simulated suite."""
 
     recordings: tuple[str, ...] = ()
     validation: tuple[str, ...] = ()
     clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
-    simulate: SimulateSettings = dataclasses.field(default_factory=SimulateSettings)
+    suite: Mapping[str, Any] | None = None  # settings of a suite (tagjax.sim.suites.Suite), used without `recordings`
+    suites_folder: str = "recordings/benchmark"  # where suites lie; missing recordings are simulated into it
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
 
 

@@ -136,7 +136,6 @@ def _written(path: str) -> dict[str, Any]:
         ("objective/coherent.yaml", None, ObjectiveSettings),
         ("data/default.yaml", None, DataSettings),
         ("data/default.yaml", "clips", config.ClipSettings),
-        ("data/default.yaml", "simulate", config.SimulateSettings),
         ("data/default.yaml", "virtual_tag", config.VirtualTagSettings),
         ("train.yaml", "scores", ScoreSettings),
         ("scores/default.yaml", None, ScoreSettings),

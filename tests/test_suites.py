@@ -367,16 +367,16 @@ def test_trains_of_like_phase_differ_by_half_a_wavelength_in_range(number):
     assert np.ptp(one) > 0.05
 
 
-def test_a_glance_shows_the_worlds_of_the_suite():
+def test_a_preview_shows_the_worlds_of_the_suite():
     suite = _named("velocity_threshold")
-    glance = suite.glance()
+    preview = suite.preview()
     first = [item for item in suite.items() if item.split == "test" and item.number == 0]
-    assert [(item.name, item.seed) for item in glance.items()] == [(item.name, item.seed) for item in first]
+    assert [(item.name, item.seed) for item in preview.items()] == [(item.name, item.seed) for item in first]
     recording = simulate_recording(
-        item_scenario(glance.items()[0]), dataclasses.replace(glance.capture, width=32), seed=1, name="x"
+        item_scenario(preview.items()[0]), dataclasses.replace(preview.capture, width=32), seed=1, name="x"
     )
     assert recording.num_frames == 6
-    assert [item.split for item in _named("corpus").glance().items()] == ["train"] * 10
+    assert [item.split for item in _named("corpus").preview().items()] == ["train"] * 10
 
 
 def test_readers_and_stories_differ_by_variant():

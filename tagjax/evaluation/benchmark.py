@@ -145,7 +145,9 @@ def _coherence(settings: BenchmarkSettings) -> Timing:
 
 
 def _small_recording(settings: BenchmarkSettings):
-    return simulate_recording(SceneSettings(width=320, height=240, num_frames=24), seed=settings.seed)
+    scenario = build_scenario("walkers", np.random.default_rng(settings.seed), 3.0)
+    capture = CaptureSettings(sensor="xtion", width=320, frame_rate_hz=10.0)
+    return simulate_recording(scenario, capture, seed=settings.seed, name="benchmark", num_frames=24)
 
 
 def _radio(settings: BenchmarkSettings) -> Timing:

@@ -100,8 +100,8 @@ def save_preview(suite: Suite, folder: Path, *, workers: int = 1, width: int = 9
     Six frames of the first recording of every variant are simulated for it, and not kept.
     """
     with tempfile.TemporaryDirectory() as scratch:
-        make_suite(suite.glance(), Path(scratch), workers=workers)
-        sheet = cv2.imread(str(save_sheet(suite.glance(), Path(scratch))))
+        make_suite(suite.preview(), Path(scratch), workers=workers)
+        sheet = cv2.imread(str(save_sheet(suite.preview(), Path(scratch))))
     assert sheet is not None
     shrink = min(1.0, width / sheet.shape[1])
     sheet = cv2.resize(sheet, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)

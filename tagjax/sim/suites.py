@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
 import itertools
 import json
 import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -31,7 +33,7 @@ PLANAR = "planar_101"
 
 MANIFEST = "suite.json"
 
-_VERSION = 2
+_VERSION = 3
 _DRAWS = 6
 
 
@@ -99,7 +101,7 @@ class Suite:
             self, duration_s=min(self.duration_s, self.smoke_s), capture=capture, counts=Counts(0, 0, 1)
         )
 
-    def glance(self, num_frames: int = 6) -> Suite:
+    def preview(self, num_frames: int = 6) -> Suite:
         """A few frames of the first recording of every variant (of test, or else of training), for a contact sheet.
 
         The worlds are those of the suite itself.
@@ -192,10 +194,10 @@ def make_item(item: Item, folder: Path) -> Made:
 
 
 def prepare(suite: Suite, folder: Path) -> list[Item]:
-    """Check the output folder and say which recordings are still to be made; partial ones of a killed run are removed.
+    """Check the suite's folder and return the recordings that are missing. Leftovers of an interrupted run are removed.
 
-    The folder may hold the suite with other counts. Raises `RecordingError`, and touches nothing, where it holds something
-    else or another version of the suite.
+    The folder may hold the suite with other counts. Raises `RecordingError`, and changes nothing, where it holds something
+    else or the suite with other settings. The caller holds the lock of `exclusive_folder`.
     """
     home = folder / suite.name
     manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
@@ -204,13 +206,15 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
             found = json.loads((home / MANIFEST).read_text())
         except (OSError, ValueError) as error:
             raise RecordingError(
-                f"{home} holds something else (no readable {MANIFEST}). Name another folder with out=."
+                f"{home} has no readable {MANIFEST}; expected a folder made for this suite, or none. Choose another "
+                "folder, or remove this one."
             ) from error
         differs = {key for key in {*found, *manifest} if found.get(key) != manifest.get(key)}
-        # A recording follows from its variant, split and number: more of them leave those there as they are.
-        if differs - {"counts"}:
+        # A recording is determined by its variant, split and number: other counts or texts leave the recordings valid.
+        if settings := differs - {"counts", "about", "paper"}:
             raise RecordingError(
-                f"{home} holds this suite with other settings ({', '.join(sorted(differs))}). Name another folder with out=."
+                f"{home} holds this suite with other settings ({', '.join(sorted(settings))}). Choose another folder, or "
+                "remove this one."
             )
     else:
         home.mkdir(parents=True)
@@ -222,6 +226,18 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
     return [item for item in suite.items() if not item.path(folder).exists()]
 
 
+@contextlib.contextmanager
+def exclusive_folder(suite: Suite, folder: Path) -> Iterator[None]:
+    """Wait until no other process simulates this suite into this folder, and keep others waiting meanwhile.
+
+    The operating system releases the lock of a process that ends in any way.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f".{suite.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def make_suite(
     suite: Suite,
     folder: Path,
@@ -230,26 +246,31 @@ def make_suite(
     on_done: Callable[[Made], None] | None = None,
     wanted: Callable[[Item], bool] = lambda item: True,
 ) -> list[Made]:
-    """Make what is `wanted` and missing of a suite; finished recordings are kept, whatever happens to the rest.
+    """Simulate the missing recordings of a suite that are `wanted`. Finished recordings are kept if a later one fails.
 
-    Each recording follows from its seed alone, so the number of workers changes nothing in it.
+    Each recording is determined by its seed alone, so the number of workers changes nothing in it. Several processes may
+    call this at once: one simulates, the others wait and find the recordings there.
     """
-    todo = [item for item in prepare(suite, folder) if wanted(item)]
+    with exclusive_folder(suite, folder):
+        missing = [item for item in prepare(suite, folder) if wanted(item)]
+        return _make_items(missing, folder, workers, on_done or (lambda made: None))
+
+
+def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Callable[[Made], None]) -> list[Made]:
     made: list[Made] = []
 
     def finished(one: Made) -> None:
         made.append(one)
-        if on_done is not None:
-            on_done(one)
+        on_done(one)
 
-    if workers <= 1 or len(todo) <= 1:
-        for item in todo:
+    if workers <= 1 or len(items) <= 1:
+        for item in items:
             finished(make_item(item, folder))
         return made
     # Spawned, not forked: JAX's threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(todo)), mp_context=context) as pool:
-        waiting = {pool.submit(make_item, item, folder) for item in todo}
+    with ProcessPoolExecutor(min(workers, len(items)), mp_context=context) as pool:
+        waiting = {pool.submit(make_item, item, folder) for item in items}
         try:
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -266,14 +287,14 @@ def make_items(
     folder: Path,
     *,
     splits: Sequence[str],
-    most: int | None = None,
+    max_per_variant: int | None = None,
     workers: int = 1,
     on_done: Callable[[Made], None] | None = None,
 ) -> list[Item]:
-    """The items of some splits, the first `most` of each variant and split, made where they are missing."""
+    """The items of some splits, at most `max_per_variant` of each variant and split; missing ones are simulated."""
 
     def wanted(item: Item) -> bool:
-        return item.split in splits and (most is None or item.number < most)
+        return item.split in splits and (max_per_variant is None or item.number < max_per_variant)
 
     make_suite(suite, folder, workers=workers, on_done=on_done, wanted=wanted)
     return [item for item in suite.items() if wanted(item)]

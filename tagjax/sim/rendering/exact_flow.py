@@ -28,7 +28,7 @@ def flow_between(before: Hits, after: Hits) -> FlowTruth:
     if before.geom.shape != after.geom.shape or len(before.geom_position_m) != len(after.geom_position_m):
         raise ValueError(
             f"Casts of {before.geom.shape} pixels, {len(before.geom_position_m)} geoms and {after.geom.shape}, "
-            f"{len(after.geom_position_m)} geoms: flow needs two casts of one stage at one size."
+            f"{len(after.geom_position_m)} geoms: flow needs two casts of one world at one size."
         )
     forward, forward_occluded = carried(before, after)
     backward, backward_occluded = carried(after, before)

@@ -12,13 +12,19 @@ import functools
 from collections.abc import Sequence
 from typing import SupportsFloat
 
-import mujoco
 import numpy as np
 
 from ...recording import Intrinsics
 from ..world.bodies import Body, Material, Shape, World, rotation_matrix
 from .hits import Hits
 from .viewpoint import Viewpoint, view_key
+
+try:
+    import mujoco
+except ImportError as error:  # pragma: no cover - depends on the installation
+    raise ImportError(
+        "Simulated pictures need MuJoCo, which is not installed: pip install 'tagjax[sim]' (or -e '.[sim]' in a clone)."
+    ) from error
 
 FAR_M = 60.0
 """Nothing farther away is seen."""
