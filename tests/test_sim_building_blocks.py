@@ -9,7 +9,15 @@ from tagjax.sim.world import trajectory, walks
 from tagjax.sim.world.bodies import STEP_S, World, rotation_matrix
 from tagjax.sim.world.crowd import BODY_RADIUS_M, distance_to
 from tagjax.sim.world.objects import OBJECT_KINDS, bounds, make_object
-from tagjax.sim.world.people import Hands, carried, hand_path, hold, make_person, move_person, person_bodies
+from tagjax.sim.world.people import (
+    Hands,
+    carried_poses,
+    hand_path,
+    hand_target,
+    make_person,
+    move_person,
+    person_bodies,
+)
 from tagjax.sim.world.rooms import ROOMS, make_room
 from tagjax.sim.world.rotation import frame, multiply, quaternion_of, turn_about
 
@@ -72,15 +80,15 @@ def test_impossible_motions_are_refused():
     with pytest.raises(ValueError, match="same"):
         trajectory.path_through([[0, 0, 0], [0, 0, 0]], speed_m_s=1.0)
     with pytest.raises(ValueError, match="meet"):
-        trajectory.join(trajectory.rest((0, 0, 0), 1.0), trajectory.rest((1, 0, 0), 1.0))
+        trajectory.join(trajectory.stay_at((0, 0, 0), 1.0), trajectory.stay_at((1, 0, 0), 1.0))
     with pytest.raises(ValueError, match="more than"):
-        trajectory.still_then_move(trajectory.rest((0, 0, 0), 2.0), 1.0, 2.0)
+        trajectory.wait_then_move(trajectory.stay_at((0, 0, 0), 2.0), 1.0, 2.0)
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.5])
 def test_still_then_move(speed):
     run = trajectory.path_through([[0, 0, 1], [3, 0, 1]], speed_m_s=speed, max_acceleration_m_s2=6.0)
-    path = trajectory.still_then_move(run, 1.5, 10.0)
+    path = trajectory.wait_then_move(run, 1.5, 10.0)
     assert len(path) == trajectory.num_steps(10.0)
     assert trajectory.max_speed(path[:151]) == 0
     assert trajectory.max_speed(path) == pytest.approx(speed, rel=1e-3)
@@ -138,7 +146,7 @@ def test_feet_stand_still_and_legs_hold_together(speed):
 
 def test_feet_end_side_by_side_after_a_walk():
     model = make_person(np.random.default_rng(1), height_m=1.75)
-    path = trajectory.still_then_move(trajectory.path_through([[0, 0, 0], [2, 0, 0]], speed_m_s=1.0), 0.5, 6.0)
+    path = trajectory.wait_then_move(trajectory.path_through([[0, 0, 0], [2, 0, 0]], speed_m_s=1.0), 0.5, 6.0)
     limbs = move_person(model, walks.walk_along(path)).limbs
     for side, sign in (("left", 1), ("right", -1)):
         np.testing.assert_allclose(
@@ -149,7 +157,7 @@ def test_feet_end_side_by_side_after_a_walk():
 def test_hand_reaches_what_it_can_and_no_farther():
     model = make_person(np.random.default_rng(2), height_m=1.75)
     walk = straight(1.0)
-    near, far = hold(walk, (0.35, -0.2, 1.2), 1.0, 4.0), hold(walk, (1.5, 0.3, 1.4), 2.0, 3.0)
+    near, far = hand_target(walk, (0.35, -0.2, 1.2), 1.0, 4.0), hand_target(walk, (1.5, 0.3, 1.4), 2.0, 3.0)
     person = move_person(model, walk, Hands(left=far, right=near))
     asked = np.isfinite(near[:, 0])
     assert np.linalg.norm(person.right_hand.position_m - near, axis=-1)[asked].max() < 1e-3
@@ -181,9 +189,9 @@ def test_arms_swing_against_the_legs():
 def test_carried_object_stays_in_the_hand(style):
     model = make_person(np.random.default_rng(4))
     walk = straight(1.0)
-    hands = Hands(right=hold(walk, (0.3, -0.2, 1.1)))
+    hands = Hands(right=hand_target(walk, (0.3, -0.2, 1.1)))
     hand, item = hand_path(model, walk, hands), make_object("bottle", np.random.default_rng(0))
-    poses = carried(hand, item.grip_m, style)
+    poses = carried_poses(hand, item.grip_m, style)
     turn = rotation_matrix(poses.quaternion)
     np.testing.assert_allclose(poses.position_m + turn @ np.array(item.grip_m), hand.position_m, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(poses.quaternion, axis=-1), 1, atol=1e-12)

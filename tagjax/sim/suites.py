@@ -33,7 +33,7 @@ PLANAR = "planar_101"
 
 MANIFEST = "suite.json"
 
-_VERSION = 3
+_VERSION = 2
 _DRAWS = 6
 
 
@@ -92,7 +92,7 @@ class Suite:
             raise ValueError(f"{self.name}: counts {self.counts}, {len(self.variants)} variants; expected some.")
         names = [variant.name for variant in self.variants]
         if len(set(names)) != len(names):
-            raise ValueError(f"{self.name}: variants share a name: {', '.join(names)}.")
+            raise ValueError(f"{self.name}: variants fraction a name: {', '.join(names)}.")
 
     def smoke(self) -> Suite:
         """The suite in small, for tests: pictures 64 pixels wide, `smoke_s` long, one test recording a variant."""

@@ -103,17 +103,17 @@ def _pictures(
     atlas: Array,
     photographs: Array | None,
 ) -> Float[Array, "2 height width 3"]:
-    """Colours of both pictures; at an edge, each of two layers has its share of the pixel."""
+    """Colours of both pictures; at an edge, each of two layers has its fraction of the pixel."""
     numbers = jnp.arange(1, len(values[0]) + 1, dtype=jnp.int32).reshape(-1, 1, 1)
-    tops, unders, shares = [], [], []
+    tops, unders, fractions = [], [], []
     for value in values:
         slope_y, slope_x = jnp.gradient(value, axis=(1, 2))
         slope = jnp.maximum(jnp.sqrt(slope_x**2 + slope_y**2), 0.1)
-        share = jnp.clip(0.5 - value / slope, 0.0, 1.0)
-        tops.append(_nearest(share > 0))
-        # Where three layers meet in a pixel, the third one's share goes to the second.
-        unders.append(_nearest((share > 0) & (numbers < tops[-1][None])))
-        shares.append(jnp.sum(jnp.where(numbers == tops[-1][None], share, 0.0), axis=0)[..., None])
+        fraction = jnp.clip(0.5 - value / slope, 0.0, 1.0)
+        tops.append(_nearest(fraction > 0))
+        # Where three layers meet in a pixel, the third one's fraction goes to the second.
+        unders.append(_nearest((fraction > 0) & (numbers < tops[-1][None])))
+        fractions.append(jnp.sum(jnp.where(numbers == tops[-1][None], fraction, 0.0), axis=0)[..., None])
 
     def colour(job):
         moved, number = job
@@ -123,7 +123,7 @@ def _pictures(
         return look.paint(_rows(scene.surface, number), geometry.to_local(motion, at), atlas, photographs)
 
     colours = jax.lax.map(colour, (jnp.asarray([False, True, False, True]), jnp.stack(tops + unders)))
-    alpha = jnp.stack(shares)
+    alpha = jnp.stack(fractions)
     return alpha * colours[:2] + (1 - alpha) * colours[2:]
 
 
@@ -157,7 +157,7 @@ def flow_pair(
 ) -> FlowPair:
     """One random pair with exact flow and occlusion, both ways; the same for the same key. `vmap` over keys.
 
-    `photographs` (0 to 1, or uint8) are pasted on a share of the layers, one of their pixels to about one of ours.
+    `photographs` (0 to 1, or uint8) are pasted on a fraction of the layers, one of their pixels to about one of ours.
     Flow is the layers' motion in closed form, in either direction: exact but for float32 (about 1e-4 px).
     """
     scene_key, atlas_key, camera_key = jax.random.split(key, 3)

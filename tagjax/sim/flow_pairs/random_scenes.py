@@ -14,7 +14,7 @@ from . import appearance as look
 from . import layers as geometry
 
 _NUM_ROWS = 96  # uniform numbers for each layer, and for the scene; more than are used
-_SHARES = ("static_scene_probability", "static_camera_probability", "static_layer_probability", "bend_probability", "low_texture_probability", "photo_probability",
+_PROBABILITIES = ("static_scene_probability", "static_camera_probability", "static_layer_probability", "bend_probability", "low_texture_probability", "photo_probability",
            "lighting_change_probability")  # fmt: skip
 _RANGES = ("radius_px", "motion_px", "camera_motion_px")
 _SIZES = ("turn_rad", "zoom", "bend_px", "camera_turn_rad", "camera_zoom", "camera_tilt", "gain", "offset", "gamma",
@@ -61,7 +61,7 @@ class FlowPairSettings:
         low, high = self.num_layers
         if not 1 <= low <= high:
             raise ValueError(f"num_layers is {self.num_layers}; expected 1 <= fewest <= most.")
-        for name in _SHARES:
+        for name in _PROBABILITIES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected a probability from 0 to 1.")
         for name in _RANGES:

@@ -92,8 +92,8 @@ def plane_paths(
     side_tag = _dot(planes.normal, tag_m[None] - planes.centre_m)
     image = antenna_m[None] - 2 * side_antenna[:, None] * planes.normal
     ray = tag_m[None] - image
-    share = safe_divide(side_antenna, side_antenna + side_tag)
-    hit = image + share[:, None] * ray - planes.centre_m
+    fraction = safe_divide(side_antenna, side_antenna + side_tag)
+    hit = image + fraction[:, None] * ray - planes.centre_m
     across = jnp.cross(planes.normal, planes.along)
     place = jnp.abs(jnp.stack([_dot(hit, planes.along), _dot(hit, across)], axis=-1))
     inside = jnp.prod(jax.nn.sigmoid((planes.half_size_m - place) / EDGE_M), axis=-1)

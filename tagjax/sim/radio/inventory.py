@@ -57,7 +57,7 @@ class InventorySettings:
     region: str = "fcc"
     flip_probability: float = 0.08  # 0 for FM0, 0.06 to 0.12 for Miller encodings (11 to 21 % of the steps in logs)
     dwell_s: float = DWELL_S
-    dropout: float = 0.03  # share of the rounds in which a tag is not heard, beside those too weak
+    dropout: float = 0.03  # fraction of the rounds in which a tag is not heard, beside those too weak
     outages_per_minute: float = 1.0
     rounds_per_antenna: int = ROUNDS_PER_ANTENNA
     rssi_at_1m_dbm: float = RSSI_AT_1M_DBM  # of this set-up in free space
@@ -70,7 +70,7 @@ class InventorySettings:
     def __post_init__(self):
         self.reader()
         if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout is {self.dropout}; expected a share from 0 to below 1.")
+            raise ValueError(f"dropout is {self.dropout}; expected a fraction from 0 to below 1.")
         if self.rounds_per_antenna < 1:
             raise ValueError(f"rounds_per_antenna is {self.rounds_per_antenna}; an antenna needs at least 1 round.")
         if not 0 <= self.latency_s[0] <= self.latency_s[1]:
@@ -130,7 +130,7 @@ def simulate_inventory(
 ) -> Inventory:
     """Reads of all tags on their paths by one reader, with the truth of each read.
 
-    Paths by EPC, antennas and environment share one frame, metres; times count from `origin_ns`. On each path's own
+    Paths by EPC, antennas and environment fraction one frame, metres; times count from `origin_ns`. On each path's own
     samples, by EPC and linear in between: `transmission` (samples,) or (samples, antennas), the ratio of fields that the
     line of sight keeps (default 1), and `dipole` (samples, 3), the tag's axis (default isotropic). `boresight`: axes of
     the antennas (default isotropic). `scatterer_path` moves the environment's scatterers: times (samples,) and places

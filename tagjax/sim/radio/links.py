@@ -87,8 +87,8 @@ class SetUp:
         known = np.all(np.isfinite(position), axis=1)
         time_s, tag, antenna, position, passed = (x[known] for x in (time_s, tag, antenna, position, passed))
         channel = channel_at(time_s, self.state, self.settings)
-        rest = self.environment.scatterers.position_m
-        around = np.broadcast_to(rest, (len(time_s), *rest.shape))
+        scatterers_m = self.environment.scatterers.position_m
+        around = np.broadcast_to(scatterers_m, (len(time_s), *scatterers_m.shape))
         if self.scatterer_path is not None:
             around = interpolate(time_s, *self.scatterer_path)
         carrier, place = self.state.hop_table_hz[channel], self.antennas_m[antenna]
@@ -103,10 +103,10 @@ class SetUp:
         shape = (len(when), len(self.paths), len(self.antennas_m))
         sample, tag, antenna = (grid.ravel() for grid in np.indices(shape))
         link = self.links(when[sample], tag, antenna)
-        heard = np.zeros(shape, bool)
+        in_range = np.zeros(shape, bool)
         at = np.searchsorted(when, link.time_s)
-        heard[at, link.tag, link.antenna] = link.rssi_dbm >= least_dbm
-        return when, heard
+        in_range[at, link.tag, link.antenna] = link.rssi_dbm >= least_dbm
+        return when, in_range
 
     def speed_m_s(self, time_s: np.ndarray, tag: np.ndarray, antenna: np.ndarray) -> np.ndarray:
         """Rate of each range; 0 at a path's very ends, where it is not known."""

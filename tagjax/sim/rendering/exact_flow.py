@@ -30,12 +30,12 @@ def flow_between(before: Hits, after: Hits) -> FlowTruth:
             f"Casts of {before.geom.shape} pixels, {len(before.geom_position_m)} geoms and {after.geom.shape}, "
             f"{len(after.geom_position_m)} geoms: flow needs two casts of one world at one size."
         )
-    forward, forward_occluded = carried(before, after)
-    backward, backward_occluded = carried(after, before)
+    forward, forward_occluded = one_way_flow(before, after)
+    backward, backward_occluded = one_way_flow(after, before)
     return FlowTruth(forward, backward, forward_occluded, backward_occluded)
 
 
-def carried(source: Hits, target: Hits) -> tuple[np.ndarray, np.ndarray]:
+def one_way_flow(source: Hits, target: Hits) -> tuple[np.ndarray, np.ndarray]:
     """Flow (height, width, 2) float32 of `source`'s pixels into `target`, and where it is occluded there.
 
     Each hit point is carried along by its geom. As geoms are convex, a point is seen again if its surface faces the

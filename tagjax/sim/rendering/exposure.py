@@ -62,6 +62,6 @@ ILLUMINATION = {
 """Lamps on; one lamp far away; curtains drawn and lamps off. The camera's gain makes up for part of it only."""
 
 
-def auto_exposure(radiance: np.ndarray, *, white: float = 0.8, share: float = 0.95) -> float:
-    """The exposure that puts a share of a picture's values below `white`; of the first frame, at bright light."""
-    return float(white / max(np.quantile(radiance[::4, ::4], share), 1e-3))
+def auto_exposure(radiance: np.ndarray, *, white: float = 0.8, fraction: float = 0.95) -> float:
+    """The exposure that puts a fraction of a picture's values below `white`; of the first frame, at bright light."""
+    return float(white / max(np.quantile(radiance[::4, ::4], fraction), 1e-3))

@@ -31,7 +31,7 @@ FAR_M = 60.0
 
 _SHADOW_GAP_M = 0.003
 _MAX_VIEWS = 4
-_REST, _MOVING = (np.array([on, not on, 0, 0, 0, 0], np.uint8) for on in (True, False))
+_STATIC, _MOVING = (np.array([on, not on, 0, 0, 0, 0], np.uint8) for on in (True, False))
 
 
 @functools.lru_cache(maxsize=16)
@@ -103,13 +103,13 @@ class Raycaster:
 
     def cast(self, view: Viewpoint) -> Hits:
         """What a camera sees of the world as it is posed, one ray a pixel."""
-        rays, rest = self._background(view)
+        rays, static = self._background(view)
         position, rotation = self.data.geom_xpos.copy(), self.data.geom_xmat.reshape(-1, 3, 3).copy()
-        shape = rest.geom.shape
+        shape = static.geom.shape
         pixels = np.flatnonzero(self._may_move(view))
         geom, distance, normal = self._shoot(view.position_m, rays[pixels], _MOVING)
         depth = distance * _lens(view.intrinsics)[1][pixels]
-        behind = rest.depth_m.ravel()[pixels]
+        behind = static.depth_m.ravel()[pixels]
         nearer = (geom >= 0) & ((depth < behind) | (behind == 0))
         pixels, geom, depth, normal = pixels[nearer], geom[nearer], depth[nearer], normal[nearer]
         world = view.position_m + rays[pixels] * distance[nearer, None]
@@ -124,11 +124,11 @@ class Raycaster:
 
         return Hits(
             view,
-            laid_over(rest.geom, geom),
-            laid_over(rest.depth_m, depth),
-            laid_over(rest.normal, normal),
-            laid_over(rest.local_m, local),
-            laid_over(rest.world_m, world),
+            laid_over(static.geom, geom),
+            laid_over(static.depth_m, depth),
+            laid_over(static.normal, normal),
+            laid_over(static.local_m, local),
+            laid_over(static.world_m, world),
             moving,
             position,
             rotation,
@@ -151,9 +151,9 @@ class Raycaster:
         light = np.asarray(light_m, float)
         key = (*view_key(hits.view), light.tobytes())
         if key not in self._lit:
-            rest = self.background(hits.view)
-            every = np.arange(rest.geom.size)
-            _keep(self._lit, key, ~self._shaded(rest, every, light, _REST).reshape(rest.geom.shape))
+            static = self.background(hits.view)
+            every = np.arange(static.geom.size)
+            _keep(self._lit, key, ~self._shaded(static, every, light, _STATIC).reshape(static.geom.shape))
         lit = self._lit[key].copy()
         if not self.geom_moves.any():
             return lit
@@ -177,13 +177,13 @@ class Raycaster:
             unit, cosine = _lens(view.intrinsics)
             rays = unit @ view.rotation.T
             shape = (view.intrinsics.height, view.intrinsics.width)
-            geom, distance, normal = self._shoot(view.position_m, rays, _REST)
+            geom, distance, normal = self._shoot(view.position_m, rays, _STATIC)
             position, rotation = self.data.geom_xpos.copy(), self.data.geom_xmat.reshape(-1, 3, 3).copy()
             hit = geom >= 0
             index = np.maximum(geom, 0)
             world = np.where(hit[:, None], view.position_m + rays * distance[:, None], 0.0)
             local = np.where(hit[:, None], np.einsum("nji,nj->ni", rotation[index], world - position[index]), 0.0)
-            rest = Hits(
+            static = Hits(
                 view,
                 geom.reshape(shape),
                 np.where(hit, distance * cosine, 0.0).reshape(shape),
@@ -194,7 +194,7 @@ class Raycaster:
                 position,
                 rotation,
             )
-            _keep(self._views, key, (rays, rest))
+            _keep(self._views, key, (rays, static))
         return self._views[key]
 
     def _shoot(
@@ -274,7 +274,7 @@ def _bounding_spheres(model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _placed(body: Body, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """World position and quaternion of a shape of a body at rest."""
+    """World position and quaternion of a shape of a body that never moves."""
     place, turn = body.poses.at(0)
     quaternion = np.zeros(4)
     mujoco.mju_mulQuat(quaternion, np.asarray(turn, float), np.asarray(shape.quaternion, float))

@@ -152,7 +152,7 @@ SENSORS: dict[str, KinectV2 | Xtion] = {"kinect_v2": KinectV2(), "xtion": Xtion(
 def frame_times(
     num_frames: int, rate_hz: float, rng: np.random.Generator, *, jitter_s: float = 0.004, drop_probability: float = 0.0
 ) -> np.ndarray:
-    """Times (num_frames,) in seconds from 0, strictly rising: nominal, jittered, a share of frames dropped between.
+    """Times (num_frames,) in seconds from 0, strictly rising: nominal, jittered, a fraction of frames dropped between.
 
     Jitter is normal and kept below 0.4 frames, so that frames never change places.
     """

@@ -40,7 +40,7 @@ class Surface:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Rest:
+class _StaticPart:
     """A viewpoint's surfaces and light where nothing moves: kept, and patched where something does."""
 
     surface: Surface
@@ -55,13 +55,13 @@ class Shader:
         self.raycaster = raycaster
         self._paint = Paint(raycaster.geom_shape)
         self._shine = np.array([material.shine for material in raycaster.materials], np.float32)
-        self._rest: dict[tuple, _Rest] = {}
+        self._static_parts: dict[tuple, _StaticPart] = {}
 
     def surface(self, hits: Hits) -> Surface:
         """Albedo and shine of every pixel of a cast; black and matt where nothing was hit."""
-        rest = self._at_rest(hits.view).surface
+        static = self._static_part(hits.view).surface
         pixels = np.flatnonzero(hits.moving)
-        albedo, shine = rest.albedo.copy(), rest.shine.copy()
+        albedo, shine = static.albedo.copy(), static.shine.copy()
         albedo.reshape(-1, 3)[pixels], shine.reshape(-1)[pixels] = self._surface(hits, pixels)
         return Surface(albedo, shine)
 
@@ -72,12 +72,12 @@ class Shader:
         light, a little stronger from above.
         """
         surface = self.surface(hits) if surface is None else surface
-        rest = self._at_rest(hits.view)
+        static = self._static_part(hits.view)
         pixels = np.flatnonzero(hits.moving)
-        light_sum = rest.ambient.copy()
+        light_sum = static.ambient.copy()
         light_sum.reshape(-1)[pixels] = self._ambient(hits, pixels)
         glare_sum = np.zeros_like(light_sum)
-        for light, (diffuse, glare) in zip(self.raycaster.world.lights, rest.lights, strict=True):
+        for light, (diffuse, glare) in zip(self.raycaster.world.lights, static.lights, strict=True):
             diffuse, glare = diffuse.copy(), glare.copy()
             diffuse.reshape(-1)[pixels], glare.reshape(-1)[pixels] = self._light(hits, pixels, light)
             if shadows:
@@ -108,22 +108,22 @@ class Shader:
         self.raycaster.pose(step)
         return total / np.float32(num_casts)
 
-    def _at_rest(self, view: Viewpoint) -> _Rest:
+    def _static_part(self, view: Viewpoint) -> _StaticPart:
         key = view_key(view)
-        if key not in self._rest:
-            while len(self._rest) >= _MAX_VIEWS:
-                self._rest.pop(next(iter(self._rest)))
+        if key not in self._static_parts:
+            while len(self._static_parts) >= _MAX_VIEWS:
+                self._static_parts.pop(next(iter(self._static_parts)))
             hits = self.raycaster.background(view)
             shape = hits.geom.shape
             every = np.arange(hits.geom.size)
             albedo, shine = self._surface(hits, every)
             lights = [self._light(hits, every, light) for light in self.raycaster.world.lights]
-            self._rest[key] = _Rest(
+            self._static_parts[key] = _StaticPart(
                 Surface(albedo.reshape(*shape, 3), shine.reshape(shape)),
                 self._ambient(hits, every).reshape(shape),
                 tuple((diffuse.reshape(shape), glare.reshape(shape)) for diffuse, glare in lights),
             )
-        return self._rest[key]
+        return self._static_parts[key]
 
     def _surface(self, hits: Hits, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         geom = hits.geom.reshape(-1)[pixels]

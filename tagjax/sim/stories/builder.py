@@ -1,4 +1,4 @@
-"""What stories share: a world in the making, places to stand, hands that wave, people and things around."""
+"""What stories fraction: a world in the making, places to stand, hands that wave, people and things around."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ..world.bodies import Body, Poses, Tag, World
 from ..world.crowd import is_free
 from ..world.figure import PersonModel
 from ..world.objects import ObjectModel, make_object
-from ..world.people import Hands, PersonMotion, badge_m, hold, limb_bodies, make_person, move_person
+from ..world.people import Hands, PersonMotion, badge_m, hand_target, limb_bodies, make_person, move_person
 from ..world.rooms import Room
 from ..world.rotation import turn_about
-from ..world.trajectory import num_steps, still_then_move, wave
+from ..world.trajectory import num_steps, wait_then_move, wave
 from ..world.walks import Walk, random_walks, walk_along
 from .scenario import Scenario
 
@@ -101,7 +101,7 @@ class ScenarioBuilder:
         )
 
 
-def standing(place: tuple[float, float], heading_rad: float, steps: int) -> Walk:
+def standing_walk(place: tuple[float, float], heading_rad: float, steps: int) -> Walk:
     """A walk that never leaves its place (x, y)."""
     return walk_along(np.broadcast_to(np.array(place), (steps, 2)), heading_rad)
 
@@ -111,33 +111,33 @@ def facing_towards(place: Sequence[float], other: Sequence[float]) -> float:
     return float(np.arctan2(other[1] - place[1], other[0] - place[0]))
 
 
-def resting(model: ObjectModel, place: Sequence[float], yaw_rad: float = 0.0) -> Poses:
+def placed_object(model: ObjectModel, place: Sequence[float], yaw_rad: float = 0.0) -> Poses:
     """An object that stands at a place: x, y, and the height of what is below it."""
     x, y, z = place
     return Poses.fixed((x, y, z + model.half_size_m[2]), turn_about(UP, yaw_rad))
 
 
-def waved_hand(
+def waving_hand(
     walk: Walk, side: int, rng: np.random.Generator, duration_s: float, speed_m_s: float, stationary_s: float
 ) -> np.ndarray:
     """World path of a hand that is still before the body, then waves at random with the given peak speed."""
     offset = (HAND_M[0], side * HAND_M[1], HAND_M[2] + float(rng.uniform(-0.05, 0.1)))
-    start = hold(walk, offset)
+    start = hand_target(walk, offset)
     stationary_s = min(stationary_s, 0.4 * duration_s)
     moving = duration_s - stationary_s
     # An arm that stays in front of the body reaches about 0.3 m around; faster waves need harder pushes.
     push = max(12.0, 5.5 * speed_m_s**2)
     path = wave("random", (0.0, 0.0, 0.0), moving, peak_speed_m_s=speed_m_s, max_acceleration_m_s2=push, rng=rng)
-    offsets = still_then_move(path, stationary_s, duration_s)
-    return start + fitted(offsets, len(start))
+    offsets = wait_then_move(path, stationary_s, duration_s)
+    return start + with_length(offsets, len(start))
 
 
-def ease(share: np.ndarray) -> np.ndarray:
+def ease(fraction: np.ndarray) -> np.ndarray:
     """0 to 1 with the first derivative zero at both ends; gentler in the middle than `smooth_step`."""
-    return share * share * (3 - 2 * share)
+    return fraction * fraction * (3 - 2 * fraction)
 
 
-def fitted(path: np.ndarray, steps: int) -> np.ndarray:
+def with_length(path: np.ndarray, steps: int) -> np.ndarray:
     """The path cut, or its end held, to a number of steps."""
     return path[np.minimum(np.arange(steps), len(path) - 1)]
 
@@ -180,10 +180,10 @@ def add_walkers(
         count, duration_s, rng, area_m=(min(behind, x1 - 1.2), y0, x1, y1), obstacles_m=room.obstacles_m
     )
     for walk in walks:
-        builder.person(make_person(rng), trimmed(walk, builder.steps), Hands())
+        builder.person(make_person(rng), walk_of_length(walk, builder.steps), Hands())
 
 
-def trimmed(walk: Walk, steps: int) -> Walk:
+def walk_of_length(walk: Walk, steps: int) -> Walk:
     """The walk cut, or its end held, to a number of steps."""
     index = np.minimum(np.arange(steps), len(walk.heading_rad) - 1)
     return Walk(*(getattr(walk, field.name)[index] for field in dataclasses.fields(walk)))
@@ -204,7 +204,7 @@ def add_static_tags(
             if np.linalg.norm(np.array(place) - antenna) <= within_m:
                 break
             place = _resting_place(builder.room, rng)
-        builder.object(model, resting(model, place, rng.uniform(0, 2 * np.pi)), labelled=False)
+        builder.object(model, placed_object(model, place, rng.uniform(0, 2 * np.pi)), labelled=False)
 
 
 _PLACES = 30

@@ -8,13 +8,13 @@ import numpy as np
 
 from ..rendering.visibility import intervals, sampled_steps, visible_fraction
 from ..world.bodies import STEP_S
-from ..world.crowd import BODY_RADIUS_M, is_free, walkway
+from ..world.crowd import BODY_RADIUS_M, is_free, is_walkable
 from ..world.objects import CARRIED_KINDS, make_object
-from ..world.people import Hands, carried, hold, make_person
+from ..world.people import Hands, carried_poses, hand_target, make_person
 from ..world.rooms import Room, make_room
-from ..world.trajectory import num_steps, path_through, smooth_step, still_then_move
+from ..world.trajectory import num_steps, path_through, smooth_step, wait_then_move
 from ..world.walks import Walk, walk_along
-from .builder import HAND_M, ScenarioBuilder, fitted, waved_hand
+from .builder import HAND_M, ScenarioBuilder, waving_hand, with_length
 from .scenario import Scenario
 
 INSIDE_S = 3.0
@@ -50,7 +50,7 @@ def enter_leave(
         model = make_object(str(rng.choice(CARRIED_KINDS)), rng)
         hands = Hands(right=_hand(walk, room, rng, duration_s))
         motion = builder.person(make_person(rng), walk, hands)
-        builder.object(model, carried(motion.right_hand, model.grip_m))
+        builder.object(model, carried_poses(motion.right_hand, model.grip_m))
     scenario = builder.scenario(f"{num_people} people come in through a door and leave by it")
     _check(scenario)
     return scenario
@@ -87,11 +87,11 @@ def _visit(rng, room: Room, number: int, duration_s: float, speed: tuple[float, 
     for _ in range(int(rng.integers(1, 5))):
         goal = np.array([rng.uniform(area[0] + 0.3, area[2] - 0.6), rng.uniform(area[1], area[3])])
         far = np.linalg.norm(goal - at) > 0.8
-        if not (far and is_free(goal, area, obstacles, BODY_RADIUS_M + 0.1) and walkway(at, goal, obstacles)):
+        if not (far and is_free(goal, area, obstacles, BODY_RADIUS_M + 0.1) and is_walkable(at, goal, obstacles)):
             return None
         way.append(goal)
         at = goal
-    if np.linalg.norm(at - before) < 0.8 or not walkway(at, before, obstacles):
+    if np.linalg.norm(at - before) < 0.8 or not is_walkable(at, before, obstacles):
         return None
     way += [before, behind, wait]
     pace = float(rng.uniform(*speed))
@@ -104,7 +104,7 @@ def _visit(rng, room: Room, number: int, duration_s: float, speed: tuple[float, 
         return None
     # Whoever waits nearer to the door goes first, more or less.
     delay = AWAY_S + rng.uniform(0.0, spare)
-    path = fitted(still_then_move(path, delay), num_steps(duration_s))[:, :2]
+    path = with_length(wait_then_move(path, delay), num_steps(duration_s))[:, :2]
     clear = [_clearance(path, box) for box in obstacles]
     return path if min(clear) >= BODY_RADIUS_M else None
 
@@ -117,10 +117,10 @@ def _clearance(path: np.ndarray, box: tuple[float, float, float, float]) -> floa
 def _hand(walk: Walk, room: Room, rng: np.random.Generator, duration_s: float) -> np.ndarray:
     """The right hand's path: waved a little in the room, close to the body in the doorway and behind it."""
     assert room.door is not None
-    waved = waved_hand(walk, -1, rng, duration_s, 0.5, 0.0)
-    close = hold(walk, (HAND_M[0] - 0.06, -0.14, 1.05))
-    share = smooth_step((room.door.opening_m[0] - 0.5 - walk.position_m[:, 0]) / 0.8)[:, None]
-    return share * waved + (1 - share) * close
+    waved = waving_hand(walk, -1, rng, duration_s, 0.5, 0.0)
+    close = hand_target(walk, (HAND_M[0] - 0.06, -0.14, 1.05))
+    fraction = smooth_step((room.door.opening_m[0] - 0.5 - walk.position_m[:, 0]) / 0.8)[:, None]
+    return fraction * waved + (1 - fraction) * close
 
 
 def _check(scenario: Scenario) -> None:

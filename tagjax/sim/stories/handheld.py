@@ -9,7 +9,7 @@ import numpy as np
 from ..world.bodies import STEP_S, Body, Material, Poses, Shape, rotation_matrix
 from ..world.figure import PersonModel
 from ..world.objects import ObjectModel, make_object
-from ..world.people import Hands, carried, hold, make_person, move_person
+from ..world.people import Hands, carried_poses, hand_target, make_person, move_person
 from ..world.rooms import make_room
 from ..world.rotation import quaternion_of
 from ..world.trajectory import smooth_step
@@ -20,9 +20,9 @@ from .builder import (
     add_walkers,
     ease,
     facing_towards,
-    standing,
     standing_places,
-    waved_hand,
+    standing_walk,
+    waving_hand,
 )
 from .scenario import Scenario
 
@@ -63,16 +63,16 @@ def handheld(
     camera = builder.room.camera_position_m
     for number, place in enumerate(places):
         facing = facing_towards(place, camera) + float(rng.uniform(-0.2, 0.2))
-        walk = standing(place, facing, builder.steps)
+        walk = standing_walk(place, facing, builder.steps)
         mine = models if one_grip else models[2 * number : 2 * number + 2]
         sides = (-1, 1) if len(mine) > 1 and not one_grip else (-1,)
-        waves = [waved_hand(walk, side, rng, duration_s, speed_m_s, stationary_s) for side in sides]
+        waves = [waving_hand(walk, side, rng, duration_s, speed_m_s, stationary_s) for side in sides]
         person = make_person(rng)
         for _ in range(_DRAWS):
             # An arm that is too short stops its hand short of the wave, with a jerk.
             if _reaches(person, walk, waves):
                 break
-            waves = [waved_hand(walk, side, rng, duration_s, speed_m_s, stationary_s) for side in sides]
+            waves = [waving_hand(walk, side, rng, duration_s, speed_m_s, stationary_s) for side in sides]
         left = (
             _before(walk, waves[0], camera, duration_s) if notebook_occluder else (waves[1] if len(waves) > 1 else None)
         )
@@ -82,7 +82,7 @@ def handheld(
             _together(builder, mine, motion.right_hand)
         else:
             for model, hand in zip(mine, (motion.right_hand, motion.left_hand), strict=False):
-                builder.object(model, carried(hand, model.grip_m))
+                builder.object(model, carried_poses(hand, model.grip_m))
         if notebook_occluder:
             notebook = make_object("notebook", rng, scale=1.25)
             builder.object(notebook, _upright_sheet(notebook, motion.left_hand, camera), tagged=False)
@@ -103,7 +103,7 @@ def _reaches(person: PersonModel, walk: Walk, waves: Sequence[np.ndarray]) -> bo
 
 def _together(builder: ScenarioBuilder, models: Sequence[ObjectModel], hand: Poses) -> None:
     """All objects as one rigid bundle in a hand."""
-    first = carried(hand, models[0].grip_m)
+    first = carried_poses(hand, models[0].grip_m)
     turn = rotation_matrix(first.quaternion)
     reach = 0.0
     for number, model in enumerate(models):
@@ -117,11 +117,11 @@ def _before(walk: Walk, object_m: np.ndarray, camera_m: Sequence[float], duratio
     time_s = np.arange(len(object_m)) * STEP_S
     toward = np.asarray(camera_m) - object_m
     cover = object_m + 0.2 * toward / np.linalg.norm(toward, axis=1, keepdims=True)
-    aside = hold(walk, (0.3, 0.45, 1.0))
+    aside = hand_target(walk, (0.3, 0.45, 1.0))
     begin = 0.55 * duration_s
-    share = np.clip(np.minimum((time_s - begin) / 0.5, (begin + 2.0 - time_s) / 0.5), 0, 1)
-    share = (ease(share))[:, None]
-    return (1 - share) * aside + share * cover
+    fraction = np.clip(np.minimum((time_s - begin) / 0.5, (begin + 2.0 - time_s) / 0.5), 0, 1)
+    fraction = (ease(fraction))[:, None]
+    return (1 - fraction) * aside + fraction * cover
 
 
 def _upright_sheet(model: ObjectModel, hand: Poses, camera_m: Sequence[float]) -> Poses:
@@ -157,11 +157,13 @@ def handover(
     walks = []
     for spot, side in zip(spots, (1, -1), strict=True):
         ahead = toward + side * across
-        walks.append(standing((float(spot[0]), float(spot[1])), float(np.arctan2(ahead[1], ahead[0])), builder.steps))
+        walks.append(
+            standing_walk((float(spot[0]), float(spot[1])), float(np.arctan2(ahead[1], ahead[0])), builder.steps)
+        )
     time_s = np.arange(builder.steps) * STEP_S
     meet_s = 0.5 * duration_s
     meeting = np.array([*(0.5 * (spots[0] + spots[1]) + 0.3 * toward), 1.15])
-    away = [waved_hand(walk, side, rng, duration_s, speed_m_s, 0.5) for walk, side in zip(walks, (1, -1), strict=True)]
+    away = [waving_hand(walk, side, rng, duration_s, speed_m_s, 0.5) for walk, side in zip(walks, (1, -1), strict=True)]
     near = np.clip(1.25 * (1 - np.abs(time_s - meet_s) / 0.9), 0, 1)
     near = (ease(near))[:, None]
     targets = [(1 - near) * path + near * meeting for path in away]
@@ -169,14 +171,14 @@ def handover(
     hands = [Hands(left=targets[0]), Hands(right=targets[1])]
     motions = [builder.person(person, walk, hand) for person, walk, hand in zip(people, walks, hands, strict=True)]
     model = make_object(kind, rng)
-    giver, taker = carried(motions[0].left_hand, model.grip_m), carried(motions[1].right_hand, model.grip_m)
+    giver, taker = carried_poses(motions[0].left_hand, model.grip_m), carried_poses(motions[1].right_hand, model.grip_m)
     # Both hands are at the meeting point for a moment; the object goes over within it.
-    share = np.clip((time_s - meet_s) / 0.2 + 0.5, 0, 1)[:, None]
-    share = ease(share)
-    turn = (1 - share) * giver.quaternion + share * taker.quaternion * np.sign(
+    fraction = np.clip((time_s - meet_s) / 0.2 + 0.5, 0, 1)[:, None]
+    fraction = ease(fraction)
+    turn = (1 - fraction) * giver.quaternion + fraction * taker.quaternion * np.sign(
         np.sum(giver.quaternion * taker.quaternion, axis=1, keepdims=True) + 1e-12
     )
-    position = (1 - share) * giver.position_m + share * taker.position_m
+    position = (1 - fraction) * giver.position_m + fraction * taker.position_m
     builder.object(model, Poses(position, turn / np.linalg.norm(turn, axis=1, keepdims=True)))
     return builder.scenario("an object is handed over", look_at_m=(place[0], 0.8 * place[1], 1.1))
 
@@ -193,17 +195,17 @@ def put_down(
     builder = ScenarioBuilder(make_room(room, rng), duration_s)
     (place,) = standing_places(builder.room, rng, 1, (1.9, 2.5))
     camera = builder.room.camera_position_m
-    walk = standing(place, facing_towards(place, camera), builder.steps)
+    walk = standing_walk(place, facing_towards(place, camera), builder.steps)
     time_s = np.arange(builder.steps) * STEP_S
     down_s = 0.6 * duration_s
-    waved = waved_hand(walk, -1, rng, duration_s, speed_m_s, 0.5)
-    spot, aside = hold(walk, (0.42, -0.3, 0.95)), hold(walk, (0.12, -0.34, 0.85))
+    waved = waving_hand(walk, -1, rng, duration_s, speed_m_s, 0.5)
+    spot, aside = hand_target(walk, (0.42, -0.3, 0.95)), hand_target(walk, (0.12, -0.34, 0.85))
     # Down to the spot, a moment of rest there, then back to the side.
     lower = smooth_step(np.clip((time_s - down_s + 0.8) / 0.8, 0, 1))[:, None]
     leave = smooth_step(np.clip((time_s - down_s - 0.2) / 0.6, 0, 1))[:, None]
     hands = Hands(right=(1 - leave) * ((1 - lower) * waved + lower * spot) + leave * aside)
     person, model = make_person(rng), make_object(kind, rng)
-    held = carried(builder.person(person, walk, hands).right_hand, model.grip_m)
+    held = carried_poses(builder.person(person, walk, hands).right_hand, model.grip_m)
     release = min(int(np.ceil((down_s + 0.1) / STEP_S)), builder.steps - 1)
     index = np.minimum(np.arange(builder.steps), release)
     builder.object(model, Poses(held.position_m[index], held.quaternion[index]))

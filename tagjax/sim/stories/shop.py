@@ -14,12 +14,12 @@ import numpy as np
 
 from ..world.bodies import STEP_S, Body, Material, Poses, Shape
 from ..world.objects import ObjectModel, make_object
-from ..world.people import Hands, carried, hold, make_person
+from ..world.people import Hands, carried_poses, hand_target, make_person
 from ..world.rooms import make_room
 from ..world.rotation import turn_about
-from ..world.trajectory import num_steps, path_through, smooth_step, still_then_move
+from ..world.trajectory import num_steps, path_through, smooth_step, wait_then_move
 from ..world.walks import Walk, walk_along
-from .builder import UP, ScenarioBuilder, add_static_tags, ease, fitted, resting, trimmed
+from .builder import UP, ScenarioBuilder, add_static_tags, ease, placed_object, walk_of_length, with_length
 from .scenario import Scenario
 
 EXIT_X_M = 1.4
@@ -70,13 +70,13 @@ def shop_exit(
         points.append((inner, lane + rng.uniform(-0.15, 0.15), 0.0))
         points.append((x0 - 0.9 if leaves else rng.uniform(x1 - 1.5, x1 - 0.3), lane, 0.0))
         path = path_through(points, speed_m_s=rng.uniform(0.7, 1.2), max_acceleration_m_s2=2.0)
-        walk = trimmed(walk_along(still_then_move(path, rng.uniform(0.0, 1.0))), builder.steps)
+        walk = walk_of_length(walk_along(wait_then_move(path, rng.uniform(0.0, 1.0))), builder.steps)
         _customer(builder, rng, walk, tags_each)
     for lane in lanes[num_people:]:
         # Near and far in turn, so that they meet those who leave.
         ends = [(rng.uniform(1.6, 3.2) if k % 2 == 0 else rng.uniform(4.2, x1 - 0.3), lane, 0.0) for k in range(12)]
         path = path_through(ends, speed_m_s=rng.uniform(0.6, 1.1), max_acceleration_m_s2=2.0)
-        builder.person(make_person(rng), trimmed(walk_along(path), builder.steps), Hands())
+        builder.person(make_person(rng), walk_of_length(walk_along(path), builder.steps), Hands())
     if static_within_m is None:
         add_static_tags(builder, rng, num_static_tags)
     elif num_static_tags:
@@ -127,7 +127,7 @@ def shop_handover(
     walks = [walk(ways[0], -_LANE_M, 0.0), walk(ways[1], _LANE_M, np.pi)]
     meeting = np.array([meet_x, 0.0, 1.1])
     close = ease(np.clip(1.25 * (1 - np.abs(time_s - meet_s) / 0.9), 0, 1))[:, None]
-    held = [hold(one, (0.3, 0.2, 1.0)) for one in walks]
+    held = [hand_target(one, (0.3, 0.2, 1.0)) for one in walks]
     targets = [(1 - close) * path + close * meeting for path in held]
     spot = np.array([box_x + 0.1, _LANE_M + 0.45, 0.95])
     lower = smooth_step(np.clip((time_s - down_s + 0.7) / 0.7, 0, 1))[:, None]
@@ -137,13 +137,13 @@ def shop_handover(
         builder.person(make_person(rng), one, Hands(left=target)) for one, target in zip(walks, targets, strict=True)
     ]
     model = make_object(kind, rng, scale=0.8)
-    one, other = (carried(motion.left_hand, model.grip_m) for motion in motions)
-    share = ease(np.clip((time_s - meet_s) / 0.2 + 0.5, 0, 1))[:, None]
+    one, other = (carried_poses(motion.left_hand, model.grip_m) for motion in motions)
+    fraction = ease(np.clip((time_s - meet_s) / 0.2 + 0.5, 0, 1))[:, None]
     # Two who face each other hold it half a turn apart: whether it goes over left or right is settled once.
     middle = int(meet_s / STEP_S)
     sign = 1.0 if one.quaternion[middle] @ other.quaternion[middle] >= 0 else -1.0
-    turn = (1 - share) * one.quaternion + share * other.quaternion * sign
-    place = (1 - share) * one.position_m + share * other.position_m
+    turn = (1 - fraction) * one.quaternion + fraction * other.quaternion * sign
+    place = (1 - fraction) * one.position_m + fraction * other.position_m
     index = np.minimum(np.arange(builder.steps), int(np.ceil((down_s + 0.05) / STEP_S)))
     builder.object(model, Poses(place[index], (turn / np.linalg.norm(turn, axis=1, keepdims=True))[index]))
     x, y, z = (float(value) for value in place[index[-1]])
@@ -182,11 +182,11 @@ def grid(
         path += [(x, y)] * pause
         across += [number % 2 == 0] * (pause // 2) + [number % 2 == 1] * (pause - pause // 2)
         if number + 1 < len(points):
-            share = np.linspace(0, 1, 51)[1:-1, None]
-            smooth = ease(share)
+            fraction = np.linspace(0, 1, 51)[1:-1, None]
+            smooth = ease(fraction)
             path += list((1 - smooth) * np.array([x, y]) + smooth * np.array(points[number + 1]))
-            across += [number % 2 == 1] * len(share)
-    line, turned = fitted(np.array(path), builder.steps), fitted(np.array(across), builder.steps)
+            across += [number % 2 == 1] * len(fraction)
+    line, turned = with_length(np.array(path), builder.steps), with_length(np.array(across), builder.steps)
     place = np.column_stack([line, np.full(builder.steps, height_m)])
     turn = np.where(turned[:, None] & (tags == "level"), turn_about(UP, np.pi / 2), [1.0, 0.0, 0.0, 0.0])
     builder.object(model, Poses(place, turn))
@@ -203,12 +203,12 @@ def _shop(rng: np.random.Generator, duration_s: float, site: int | None) -> Scen
 def _customer(builder: ScenarioBuilder, rng: np.random.Generator, walk: Walk, num_tags: int) -> None:
     """A person with things in the right hand and, from the second on, in the left one in turn."""
     person = make_person(rng)
-    left = hold(walk, (0.2, 0.28, 0.95)) if num_tags > 1 else None
-    motion = builder.person(person, walk, Hands(right=hold(walk, (0.2, -0.28, 0.95)), left=left))
+    left = hand_target(walk, (0.2, 0.28, 0.95)) if num_tags > 1 else None
+    motion = builder.person(person, walk, Hands(right=hand_target(walk, (0.2, -0.28, 0.95)), left=left))
     held: list[ObjectModel] = []
     for number in range(num_tags):
         model = make_object(str(rng.choice(KINDS)), rng, scale=0.8)
-        pose = carried((motion.right_hand, motion.left_hand)[number % 2], model.grip_m)
+        pose = carried_poses((motion.right_hand, motion.left_hand)[number % 2], model.grip_m)
         lift = _lift(held[number - 2], model) if number > 1 else 0.0
         builder.object(model, Poses(pose.position_m + np.array([0.0, 0.0, lift]), pose.quaternion))
         held.append(model)
@@ -241,7 +241,7 @@ def _on_a_box(builder: ScenarioBuilder, rng: np.random.Generator, count: int, wi
     for number in range(count):
         model = make_object(str(rng.choice(["book", "mug", "box"])), rng, scale=0.6)
         spot = (x + half * (number % 2 - 0.5), y + half * (number // 2 % 2 - 0.5), top)
-        builder.object(model, resting(model, spot, float(rng.uniform(0, 2 * np.pi))), labelled=False)
+        builder.object(model, placed_object(model, spot, float(rng.uniform(0, 2 * np.pi))), labelled=False)
 
 
 def _lay_level(builder: ScenarioBuilder, rng: np.random.Generator) -> None:

@@ -12,7 +12,7 @@ from ..world.objects import make_object
 from ..world.rooms import make_room
 from ..world.rotation import turn_about
 from ..world.trajectory import path_through
-from .builder import UP, ScenarioBuilder, fitted
+from .builder import UP, ScenarioBuilder, with_length
 from .scenario import Scenario
 from .tunnels import tunnels
 
@@ -143,4 +143,4 @@ def _curve(low: np.ndarray, high: np.ndarray, steps: int, rng, speed_m_s) -> np.
         if np.linalg.norm(point - points[-1]) > 0.5:
             points.append(point)
     path = path_through(points, speed_m_s=rng.uniform(*speed_m_s), max_acceleration_m_s2=1.0)[:, :2]
-    return np.clip(fitted(path, steps), low - 0.1, high + 0.1)
+    return np.clip(with_length(path, steps), low - 0.1, high + 0.1)

@@ -8,11 +8,11 @@ import numpy as np
 
 from ..world.crowd import is_free
 from ..world.objects import CARRIED_KINDS, make_object
-from ..world.people import Hands, carried, hold, make_person
+from ..world.people import Hands, carried_poses, hand_target, make_person
 from ..world.rooms import Room, make_room
 from ..world.trajectory import path_through
 from ..world.walks import random_walks, walk_along
-from .builder import ScenarioBuilder, add_static_tags, trimmed, waved_hand
+from .builder import ScenarioBuilder, add_static_tags, walk_of_length, waving_hand
 from .scenario import Scenario
 
 
@@ -38,14 +38,14 @@ def approach(
     near, far, y = _lane(builder.room, rng, max(least, 1.8))
     laps = int(np.ceil(speed_m_s * duration_s / (2 * (far - near)))) + 1
     path = path_through(_loops(near, far, y, laps), speed_m_s=speed_m_s, max_acceleration_m_s2=push)
-    walk = trimmed(walk_along(path), builder.steps)
+    walk = walk_of_length(walk_along(path), builder.steps)
     person = make_person(rng)
     if kind is None:
         builder.person(person, walk, Hands(), badge="level")
     else:
         model = make_object(kind, rng)
-        motion = builder.person(person, walk, Hands(right=hold(walk, (0.26, -0.16, 1.0))))
-        builder.object(model, carried(motion.right_hand, model.grip_m))
+        motion = builder.person(person, walk, Hands(right=hand_target(walk, (0.26, -0.16, 1.0))))
+        builder.object(model, carried_poses(motion.right_hand, model.grip_m))
     return builder.scenario(
         f"a person walks to and fro at {speed_m_s} m/s", look_at_m=((near + far) / 2, 0.5 * y, 0.95)
     )
@@ -108,14 +108,14 @@ def crowd(
         num_door=num_door,
     )
     for walk in walks:
-        walk = trimmed(walk, builder.steps)
-        swing = [builder.inside(waved_hand(walk, side, rng, duration_s, 0.5, 0.0)) for side in (-1, 1)]
+        walk = walk_of_length(walk, builder.steps)
+        swing = [builder.inside(waving_hand(walk, side, rng, duration_s, 0.5, 0.0)) for side in (-1, 1)]
         hands = Hands(right=swing[0], left=swing[1] if objects_each == 2 else None)
         person = make_person(rng)
         motion = builder.person(person, walk, hands)
         for hand in (motion.right_hand, motion.left_hand)[:objects_each]:
             model = make_object(str(rng.choice(CARRIED_KINDS)), rng)
-            builder.object(model, carried(hand, model.grip_m))
+            builder.object(model, carried_poses(hand, model.grip_m))
     add_static_tags(builder, rng, num_static_tags)
     return builder.scenario(f"{num_people} people walk, {objects_each} objects each")
 
@@ -140,5 +140,5 @@ def walkers(
         speed_m_s=(speed_m_s[0], speed_m_s[1]),
     )
     for walk in walks:
-        builder.person(make_person(rng), trimmed(walk, builder.steps), Hands(), badge="upright")
+        builder.person(make_person(rng), walk_of_length(walk, builder.steps), Hands(), badge="upright")
     return builder.scenario(f"{num_people} people with badges walk about", num_antennas=num_antennas)

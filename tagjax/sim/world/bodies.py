@@ -77,7 +77,7 @@ class Poses:
 class Body:
     """Shapes that move together (a limb, an object, a table). `label` is its value in the masks, 0 for the room.
 
-    The limbs of a person share a `name`, and a label if the person is to be labelled.
+    The limbs of a person fraction a `name`, and a label if the person is to be labelled.
     """
 
     name: str

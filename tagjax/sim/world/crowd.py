@@ -21,7 +21,7 @@ class Door:
 BODY_RADIUS_M = 0.28
 """Kept free between a walker's centre and furniture."""
 
-_BRAKE = 0.45  # share of the acceleration bound that is planned for braking; the rest turns and gives way
+_BRAKE = 0.45  # fraction of the acceleration bound that is planned for braking; the rest turns and gives way
 _MARGIN_M = 0.12  # planned on top of the distance to keep
 
 
@@ -139,13 +139,13 @@ def _choose_goal(walker, now, step_s, rng, area, obstacles, speeds, door, stop_p
     if door is not None and leaves and (walker.inner is None or walker.inner.is_home()):
         # The opening may lie behind furniture: then first to a place from where it is in sight.
         opening = np.array(door.opening_m)
-        if walkway(walker.place, opening, obstacles):
+        if is_walkable(walker.place, opening, obstacles):
             walker.leave_s, walker.through_door, walker.wait = np.inf, True, 0.0
             walker.goals = [opening, walker.home]
             walker.speed = speeds[1]
-        elif not walker.goals or not walkway(walker.goals[0], opening, obstacles):
+        elif not walker.goals or not is_walkable(walker.goals[0], opening, obstacles):
             places = (_free_place(rng, walker.place, area, obstacles) for _ in range(6))
-            seen = [place for place in places if walkway(place, opening, obstacles)]
+            seen = [place for place in places if is_walkable(place, opening, obstacles)]
             if seen:
                 walker.goals, walker.wait, walker.speed = seen[:1], 0.0, speeds[1]
     if walker.goals:
@@ -165,7 +165,7 @@ def _choose_goal(walker, now, step_s, rng, area, obstacles, speeds, door, stop_p
     walker.wait = max(0.0, walker.wait - step_s)
 
 
-def walkway(start: np.ndarray, end: np.ndarray, obstacles: tuple[Rectangle, ...]) -> bool:
+def is_walkable(start: np.ndarray, end: np.ndarray, obstacles: tuple[Rectangle, ...]) -> bool:
     """Whether one can walk straight there: sampled every 0.1 m."""
     count = int(np.hypot(*(end - start)) / 0.1) + 2
     line = start + np.linspace(0, 1, count)[:, None] * (end - start)
@@ -178,7 +178,7 @@ def _free_place(rng, start: np.ndarray, area: Rectangle, obstacles: tuple[Rectan
     found = 0
     for _ in range(40):
         place = np.array([rng.uniform(area[0], area[2]), rng.uniform(area[1], area[3])])
-        if is_free(place, area, obstacles, BODY_RADIUS_M + 0.05) and walkway(start, place, obstacles):
+        if is_free(place, area, obstacles, BODY_RADIUS_M + 0.05) and is_walkable(start, place, obstacles):
             length = float(np.hypot(*(place - start)))
             if length > best_length:
                 best, best_length = place, length

@@ -50,8 +50,8 @@ class PersonModel:
 
     @property
     def measures(self) -> Measures:
-        """Lengths by Winter's shares of the height; the grip is 0.06 of it beyond the wrist."""
-        shares = Measures(
+        """Lengths by Winter's fractions of the height; the grip is 0.06 of it beyond the wrist."""
+        fractions = Measures(
             ankle=0.039,
             ball=0.085,
             heel=0.035,
@@ -66,7 +66,7 @@ class PersonModel:
             upper_arm=0.178,
             forearm=0.205,
         )
-        return Measures(**{key: value * self.height_m for key, value in dataclasses.asdict(shares).items()})
+        return Measures(**{key: value * self.height_m for key, value in dataclasses.asdict(fractions).items()})
 
     @property
     def arm_m(self) -> float:
@@ -146,7 +146,7 @@ def _radio(material: Material, transmission_db: float) -> Material:
     return dataclasses.replace(material, transmission_db=transmission_db)
 
 
-def two_bones(
+def two_bone_joints(
     root: np.ndarray, end: np.ndarray, pole: np.ndarray, first_m: float, second_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Middle joint and end (steps, 3) of two bones from `root` to `end`, bent towards `pole`; the end is clamped."""
@@ -156,9 +156,9 @@ def two_bones(
     along = unit(toward)
     side = unit(pole - np.sum(pole * along, axis=-1, keepdims=True) * along)
     # The law of cosines.
-    share = (first_m**2 - second_m**2 + far**2) / (2 * far)
-    height = np.sqrt(np.maximum(first_m**2 - share**2, 0.0))
-    return root + share * along + height * side, root + far * along
+    fraction = (first_m**2 - second_m**2 + far**2) / (2 * far)
+    height = np.sqrt(np.maximum(first_m**2 - fraction**2, 0.0))
+    return root + fraction * along + height * side, root + far * along
 
 
 def bone_poses(start: np.ndarray, end: np.ndarray, ahead: np.ndarray) -> Poses:

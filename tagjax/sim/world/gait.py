@@ -14,7 +14,7 @@ from .bodies import STEP_S
 from .trajectory import smooth_step
 from .walks import Walk
 
-_SWING_SHARE = 0.8  # of the time between two footfalls; the rest is double support
+_SWING_FRACTION = 0.8  # of the time between two footfalls; the rest is double support
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +57,13 @@ def plan_feet(walk: Walk, size: FootSize) -> tuple[FootPlan, FootPlan]:
             ahead = min(step + round(0.6 / STEP_S), steps - 1)
             speed = float(np.linalg.norm(walk.position_m[ahead] - walk.position_m[step])) / 0.6
             between = step_time_s(speed) / STEP_S
-            land = step + max(2, round(_SWING_SHARE * between))
+            land = step + max(2, round(_SWING_FRACTION * between))
             middle = min(land + round(0.6 * between), steps - 1)
             target, facing = neutral[foot][middle], heading[middle]
             if np.linalg.norm(target - at[foot][0]) > 0.03 or abs(facing - at[foot][1]) > 0.15:
                 plants[foot].append((step, land, target, facing))
                 at[foot] = (target, facing)
-                step = land + max(1, round((1 - _SWING_SHARE) * between))
+                step = land + max(1, round((1 - _SWING_FRACTION) * between))
                 side, moved = 1 - foot, True
                 break
         if not moved:
@@ -90,13 +90,13 @@ def _foot_motion(start, plants, steps: int, size: FootSize) -> FootPlan:
         length = float(np.linalg.norm(target - previous[0]))
         strength = min(1.0, length / 1.3)
         swing = np.arange(off, min(land, steps))
-        share = (swing - off) / (land - off)
-        ease = smooth_step(share)
+        fraction = (swing - off) / (land - off)
+        ease = smooth_step(fraction)
         place[swing] = previous[0] + ease[:, None] * (target - previous[0])
         heading[swing] = previous[1] + ease * (facing - previous[1])
-        lift[swing] = (0.02 + 0.07 * strength) * np.sin(np.pi * share) ** 2
+        lift[swing] = (0.02 + 0.07 * strength) * np.sin(np.pi * fraction) ** 2
         up, down = 0.95 * strength, -0.3 * strength
-        pitch[swing] = up + smooth_step(share) * (down - up)
+        pitch[swing] = up + smooth_step(fraction) * (down - up)
         place[land:], heading[land:] = target, facing
         contact[swing] = False
         # The heel rises in the second half of the stance before, and the sole comes down after the landing.

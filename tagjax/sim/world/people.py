@@ -1,7 +1,7 @@
 """Articulated people: limbs of given proportions and clothes, a gait without sliding feet, hands that reach.
 
 Body frame: x ahead, y left, z up, origin on the floor below the hips. Proportions after Winter, Biomechanics and Motor
-Control of Human Movement (2009), table 4.1, as shares of the height.
+Control of Human Movement (2009), table 4.1, as fractions of the height.
 """
 
 from __future__ import annotations
@@ -13,24 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from .bodies import STEP_S, Body, Material, Poses, rotation_matrix
-from .figure import REACH, PersonModel, bone_poses, limb_shapes, two_bones
+from .figure import REACH, PersonModel, bone_poses, limb_shapes, two_bone_joints
 from .gait import FootPlan, FootSize, pelvis_height, plan_feet
 from .rotation import continuous, frame, multiply, quaternion_of, turn_about, unit
 from .trajectory import smooth_step
 from .walks import Walk
-
-__all__ = [
-    "Hands",
-    "PersonModel",
-    "PersonMotion",
-    "carried",
-    "hand_path",
-    "hold",
-    "limb_bodies",
-    "make_person",
-    "move_person",
-    "person_bodies",
-]
 
 Side = Literal["left", "right"]
 Target = Float[np.ndarray, "steps 3"] | None
@@ -141,7 +128,7 @@ def hand_path(model: PersonModel, walk: Walk, hands: Hands | None = None, side: 
     return motion.left_hand if side == "left" else motion.right_hand
 
 
-def hold(
+def hand_target(
     walk: Walk, offset_m: tuple[float, float, float], from_s: float = 0.0, to_s: float = np.inf
 ) -> Float[np.ndarray, "steps 3"]:
     """Hand target at a fixed place of the body frame (x ahead, y left, z above the floor); NaN outside the times."""
@@ -154,7 +141,7 @@ def hold(
     return path
 
 
-def carried(
+def carried_poses(
     hand: Poses, grip_m: tuple[float, float, float], style: Literal["upright", "fist", "hand"] = "upright"
 ) -> Poses:
     """Poses of an object that a hand holds at `grip_m` (the object's frame).
@@ -214,7 +201,7 @@ def move_person(model: PersonModel, walk: Walk, hands: Hands | None = None) -> P
         plan = plans[number]
         toes = turn_about((0.0, 0.0, 1.0), plan.heading_rad)
         knee_way = rotation_matrix(toes)[..., :, 0]
-        knee, ankle = two_bones(hip, plan.ankle_m, knee_way, m.thigh, m.shin)
+        knee, ankle = two_bone_joints(hip, plan.ankle_m, knee_way, m.thigh, m.shin)
         limbs[f"{side} thigh"] = bone_poses(hip, knee, knee_way)
         limbs[f"{side} shin"] = bone_poses(knee, ankle, knee_way)
         foot_turn = multiply(toes, turn_about((0.0, 1.0, 0.0), plan.pitch_rad))
@@ -234,7 +221,7 @@ def move_person(model: PersonModel, walk: Walk, hands: Hands | None = None) -> P
         wanted = _blended(free, target, walk.position_m, heading)
         wanted = _clamped(shoulder, wanted, m.upper_arm, m.forearm)
         away = np.einsum("nij,j->ni", rotation_matrix(chest_turn), np.array([-0.55, sign * 0.45, -0.75]))
-        elbow, grip = two_bones(shoulder, wanted, away, m.upper_arm, m.forearm)
+        elbow, grip = two_bone_joints(shoulder, wanted, away, m.upper_arm, m.forearm)
         front = rotation_matrix(chest_turn)[..., :, 0]
         limbs[f"{side} upper arm"] = bone_poses(shoulder, elbow, front)
         lower = bone_poses(elbow, grip, _thumb(elbow, grip, chest_turn))

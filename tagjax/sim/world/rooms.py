@@ -80,8 +80,8 @@ def meeting_room(rng: np.random.Generator) -> Room:
     top = (length - deep - 0.35, y - wide / 2, length - 0.35, y + wide / 2)
     table(plan, rng, top)
     cloth = surface(rng, 0.1, 0.6, scale=20.0)
-    for share in (0.25, 0.75):
-        chair(plan, rng, (top[0] - 0.32, top[1] + share * wide), rng.uniform(-0.3, 0.3), cloth)
+    for fraction in (0.25, 0.75):
+        chair(plan, rng, (top[0] - 0.32, top[1] + fraction * wide), rng.uniform(-0.3, 0.3), cloth)
     if rng.random() < 0.8:
         x = rng.uniform(1.6, 2.6)
         low, high = sorted((side * (width / 2 - 0.4), side * width / 2))
@@ -106,8 +106,8 @@ def entrance(rng: np.random.Generator) -> Room:
     x = rng.uniform(2.4, 2.9)
     table(plan, rng, (x, low, x + wide, high))
     cloth = surface(rng, 0.1, 0.6, scale=20.0)
-    for share in (0.25, 0.75):
-        place = (x + share * wide, -side * (width / 2 - 0.1 - broad - 0.3))
+    for fraction in (0.25, 0.75):
+        place = (x + fraction * wide, -side * (width / 2 - 0.1 - broad - 0.3))
         chair(plan, rng, place, -side * np.pi / 2 + rng.uniform(-0.3, 0.3), cloth)
     if rng.random() < 0.6:
         x = rng.uniform(1.8, 2.8)
@@ -118,8 +118,8 @@ def entrance(rng: np.random.Generator) -> Room:
     places = tuple((length + 0.1 + deep / 2, y - side * away) for away in (1.2, 1.95))
     room = _room("room with a door", plan, rng, size, area, Door((length + 0.05, y), places))
     lights = tuple(
-        dataclasses.replace(light, position_m=(share * length, *light.position_m[1:]))
-        for light, share in zip(room.lights, (0.3, 0.65), strict=True)
+        dataclasses.replace(light, position_m=(fraction * length, *light.position_m[1:]))
+        for light, fraction in zip(room.lights, (0.3, 0.65), strict=True)
     )
     return dataclasses.replace(
         room, lights=lights, camera_look_at_m=(0.62 * length, 0.35 * y, room.camera_look_at_m[2])
@@ -293,8 +293,8 @@ def _room(name: str, plan: Plan, rng: np.random.Generator, size: Point, area: Re
     """A room seen from its near wall, lights at the ceiling, one antenna below the camera."""
     length, width, height = size
     lights = tuple(
-        Light((share * length, float(rng.uniform(-0.25, 0.25)) * width, height - 0.15), float(rng.uniform(0.6, 1.0)))
-        for share in (0.35, 0.75)
+        Light((fraction * length, float(rng.uniform(-0.25, 0.25)) * width, height - 0.15), float(rng.uniform(0.6, 1.0)))
+        for fraction in (0.35, 0.75)
     )
     y = float(rng.uniform(-0.3, 0.3))
     camera = (-0.4, y, float(rng.uniform(1.9, 2.35)))

@@ -114,8 +114,8 @@ def chord_m(shape: Shape, start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
 def _distance(start: np.ndarray, end: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Of points (lines, 3) from segments, (lines,)."""
     ray, away = end - start, point - start
-    share = np.sum(ray * away, axis=-1) / np.maximum(np.sum(ray * ray, axis=-1), 1e-18)
-    return np.linalg.norm(away - np.clip(share, 0, 1)[:, None] * ray, axis=-1)
+    fraction = np.sum(ray * away, axis=-1) / np.maximum(np.sum(ray * ray, axis=-1), 1e-18)
+    return np.linalg.norm(away - np.clip(fraction, 0, 1)[:, None] * ray, axis=-1)
 
 
 def _slab(start: np.ndarray, ray: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

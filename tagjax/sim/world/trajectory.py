@@ -35,13 +35,13 @@ def num_steps(duration_s: float) -> int:
     return round(duration_s / STEP_S) + 1
 
 
-def smooth_step(share: np.ndarray) -> np.ndarray:
-    """0 to 1 while `share` goes from 0 to 1, first and second derivative zero at both ends."""
-    x = np.clip(np.asarray(share, float), 0.0, 1.0)
+def smooth_step(fraction: np.ndarray) -> np.ndarray:
+    """0 to 1 while `fraction` goes from 0 to 1, first and second derivative zero at both ends."""
+    x = np.clip(np.asarray(fraction, float), 0.0, 1.0)
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
-def rest(point_m: Sequence | np.ndarray, duration_s: float) -> Path:
+def stay_at(point_m: Sequence | np.ndarray, duration_s: float) -> Path:
     """Stay at a point."""
     return np.repeat(np.asarray(point_m, float)[None], num_steps(duration_s), axis=0)
 
@@ -61,12 +61,12 @@ def join(*paths_m: Path) -> Path:
     return np.concatenate(parts)
 
 
-def still_then_move(path_m: Path, stationary_s: float, duration_s: float | None = None) -> Path:
-    """Rest at the start of `path_m` for `stationary_s`, follow it, and rest at its end up to `duration_s`, if given.
+def wait_then_move(path_m: Path, wait_s: float, duration_s: float | None = None) -> Path:
+    """Rest at the start of `path_m` for `wait_s`, follow it, and rest at its end up to `duration_s`, if given.
 
     Raises `ValueError` if the path does not fit into `duration_s`.
     """
-    moved = join(rest(path_m[0], stationary_s), path_m)
+    moved = join(stay_at(path_m[0], wait_s), path_m)
     if duration_s is None:
         return moved
     left = num_steps(duration_s) - len(moved)
@@ -81,8 +81,8 @@ def still_then_move(path_m: Path, stationary_s: float, duration_s: float | None 
 def blend(first_m: Path, second_m: Path, start_s: float, duration_s: float = 0.5) -> Path:
     """Go over from one path to another of equal length between `start_s` and `start_s + duration_s`, smoothly."""
     time_s = np.arange(len(first_m)) * STEP_S
-    share = smooth_step((time_s - start_s) / max(duration_s, STEP_S))[:, None]
-    return first_m * (1 - share) + second_m * share
+    fraction = smooth_step((time_s - start_s) / max(duration_s, STEP_S))[:, None]
+    return first_m * (1 - fraction) + second_m * fraction
 
 
 def path_through(
@@ -111,7 +111,7 @@ def path_through(
         raise ValueError(f"Speed {speed_m_s} m/s and acceleration {max_acceleration_m_s2} m/s^2 must be positive.")
     chord = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     if chord.min() < 1e-6:
-        raise ValueError("Two way points in a row are the same; use `rest` and `join` for stops.")
+        raise ValueError("Two way points in a row are the same; use `stay_at` and `join` for stops.")
     knots = np.concatenate([[0.0], np.cumsum(chord)])
     curve = CubicSpline(knots, points, bc_type="natural")
     place = curve(np.interp(np.linspace(0, len(chord), _FINE * len(chord) + 1), np.arange(len(knots)), knots))
@@ -153,8 +153,8 @@ def _timed(points: np.ndarray, times: np.ndarray, acceleration: float) -> np.nda
         raise ValueError(f"times_s must be {len(points)} increasing times from 0; found {times}.")
     # A quintic between two points; a cubic spline with ends at rest through more.
     if len(points) == 2:
-        share = smooth_step(np.arange(num_steps(times[-1])) * STEP_S / times[-1])[:, None]
-        path = points[0] * (1 - share) + points[1] * share
+        fraction = smooth_step(np.arange(num_steps(times[-1])) * STEP_S / times[-1])[:, None]
+        path = points[0] * (1 - fraction) + points[1] * fraction
     else:
         path = CubicSpline(times, points, bc_type="clamped")(np.arange(num_steps(times[-1])) * STEP_S)
     found = max_acceleration(path)
