@@ -368,7 +368,7 @@ def test_a_tag_out_of_reach_takes_no_slot():
     present = np.ones((3, 7, 1), bool)
     present[1, 1:] = False
     present[2] = False
-    slots = draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), within_reach=(when, present))
+    slots = draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), in_range=(when, present))
     assert set(slots.tag[slots.time_s > 10.1]) == {0}
     assert slots.time_s.max() < 20.1
     for low, high, num in ((0.0, 10.0, 7), (10.1, 20.0, 1)):
@@ -376,7 +376,7 @@ def test_a_tag_out_of_reach_takes_no_slot():
         found = np.sum(some) / num / (high - low)
         np.testing.assert_allclose(found, 1 / (17.3e-3 + num * 4.23e-3), rtol=0.04)
     everybody = (np.zeros(1), np.ones((1, 7, 1), bool))
-    one, other = (draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), within_reach=w) for w in (None, everybody))
+    one, other = (draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), in_range=w) for w in (None, everybody))
     np.testing.assert_array_equal(one.time_s, other.time_s)
 
 
@@ -384,7 +384,7 @@ def test_antennas_wait_only_for_tags_that_they_reach():
     """A tag that only the second antenna reaches does not lengthen the first one's rounds."""
     present = np.ones((1, 4, 2), bool)
     present[0, 1:, 0] = False
-    slots = draw_schedule(0.0, 60.0, 4, np.random.default_rng(1), num_antennas=2, within_reach=(np.zeros(1), present))
+    slots = draw_schedule(0.0, 60.0, 4, np.random.default_rng(1), num_antennas=2, in_range=(np.zeros(1), present))
     assert set(slots.tag[slots.antenna == 0]) == {0}
     assert set(slots.tag[slots.antenna == 1]) == {0, 1, 2, 3}
     rounds = 60.0 / (2 * 17.3e-3 + 5 * 4.23e-3)

@@ -1,4 +1,4 @@
-"""Benchmark suites: which stories are told how often, for training, validation and test, and made on many cores."""
+"""Suites: named sets of simulated recordings with train, validation and test splits, made in several processes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .stories.scenario import Scenario
 SPLITS = ("train", "validation", "test")
 
 PLANAR = "planar_101"
-"""The one story that has no picture."""
+"""The only story without pictures."""
 
 MANIFEST = "suite.json"
 
@@ -39,7 +39,7 @@ _DRAWS = 6
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One condition of a suite: its name, and what differs from the suite's settings."""
+    """One condition of a suite: its name, and the settings that differ from the suite's."""
 
     name: str
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -50,7 +50,7 @@ class Variant:
 
 @dataclasses.dataclass(frozen=True)
 class Counts:
-    """Recordings of each variant in each split."""
+    """Number of recordings of each variant in each split."""
 
     train: int = 2
     validation: int = 1
@@ -59,7 +59,7 @@ class Counts:
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """A named experiment: everything that its recordings follow from."""
+    """A named set of recordings. These settings determine every recording."""
 
     name: str
     about: str
@@ -67,42 +67,48 @@ class Suite:
     story: str
     seed: int
     duration_s: float = 5.0
-    smoke_s: float = 2.4  # of the suite in small: less where the story is told in less, more where it needs it
+    smoke_s: float = 2.4  # duration of the recordings in small
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     capture: CaptureSettings = dataclasses.field(default_factory=CaptureSettings)
-    reader: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # what differs from the story's inventory
+    reader: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # settings that differ from the story's `InventorySettings`
     variants: tuple[Variant, ...] = (Variant("all"),)
     counts: Counts = dataclasses.field(default_factory=Counts)
 
     def __post_init__(self):
         for story in (self.story, *(variant.story for variant in self.variants if variant.story is not None)):
             if story not in (PLANAR, *STORIES):
-                raise ValueError(f"{self.name}: unknown story {story!r}; known are {', '.join([*STORIES, PLANAR])}.")
+                raise ValueError(f"{self.name}: story is {story!r}; expected one of {', '.join([*STORIES, PLANAR])}.")
         if not (self.duration_s > 0 and self.smoke_s > 0):
             raise ValueError(
-                f"{self.name}: duration_s is {self.duration_s}, smoke_s {self.smoke_s}; positive ones are needed."
+                f"{self.name}: duration_s is {self.duration_s}, smoke_s {self.smoke_s}; expected positive durations."
             )
         known = {field.name for field in dataclasses.fields(InventorySettings)}
         for reader in (self.reader, *(variant.reader for variant in self.variants)):
             if unknown := sorted(set(reader) - known):
                 raise ValueError(
-                    f"{self.name}: unknown reader setting {', '.join(unknown)}; known are {', '.join(sorted(known))}."
+                    f"{self.name}: unknown reader setting {', '.join(unknown)}; expected settings among "
+                    f"{', '.join(sorted(known))}."
                 )
         if min(dataclasses.astuple(self.counts)) < 0 or not self.variants:
-            raise ValueError(f"{self.name}: counts {self.counts}, {len(self.variants)} variants; expected some.")
+            raise ValueError(
+                f"{self.name}: {self.counts} and {len(self.variants)} variants; expected counts of at least 0 and at least "
+                "1 variant."
+            )
         names = [variant.name for variant in self.variants]
         if len(set(names)) != len(names):
-            raise ValueError(f"{self.name}: variants fraction a name: {', '.join(names)}.")
+            raise ValueError(f"{self.name}: variants are named {', '.join(names)}; expected different names.")
 
     def smoke(self) -> Suite:
-        """The suite in small, for tests: pictures 64 pixels wide, `smoke_s` long, one test recording a variant."""
+        """The suite in small, for tests: pictures 64 pixels wide, `smoke_s` long, one test recording per variant."""
         capture = dataclasses.replace(self.capture, width=64, frame_rate_hz=min(self.capture.frame_rate_hz, 5.0))
         return dataclasses.replace(
             self, duration_s=min(self.duration_s, self.smoke_s), capture=capture, counts=Counts(0, 0, 1)
         )
 
     def preview(self, num_frames: int = 6) -> Suite:
-        """A few frames of the first recording of every variant (of test, or else of training), for a contact sheet.
+        """A few frames of the first test recording of every variant (or training recording), for a contact sheet.
 
         The worlds are those of the suite itself.
         """
@@ -114,7 +120,7 @@ class Suite:
         )
 
     def items(self) -> list[Item]:
-        """Every recording of the suite."""
+        """All recordings of the suite."""
         found = []
         for split, (index, variant) in itertools.product(range(len(SPLITS)), enumerate(self.variants)):
             for number in range(dataclasses.astuple(self.counts)[split]):
@@ -139,13 +145,13 @@ class Item:
         return f"{self.suite.name}-{self.variant.name}-{self.split}-{self.number}"
 
     def path(self, folder: Path) -> Path:
-        """Where it lies within the output folder."""
+        """Path of the recording within the output folder."""
         return folder / self.suite.name / self.split / f"{self.name}.zarr"
 
 
 @dataclasses.dataclass(frozen=True)
 class Made:
-    """What making one recording took."""
+    """A simulated recording: its name, length, and the time that the simulation took."""
 
     name: str
     num_frames: int
@@ -153,9 +159,9 @@ class Made:
 
 
 def item_scenario(item: Item) -> Scenario:
-    """The world of a recording: the first of a few draws in which everything finds its place.
+    """The scenario of a recording: the first of several draws that satisfies all constraints of the story.
 
-    Raises `ValueError` with the last draw's reason if none does.
+    Raises `ValueError` with the reason of the last draw if none does.
     """
     suite, variant = item.suite, item.variant
     settings, reader = {**suite.settings, **variant.settings}, {**suite.reader, **variant.reader}
@@ -168,7 +174,7 @@ def item_scenario(item: Item) -> Scenario:
         except ValueError as error:
             if draw == _DRAWS - 1:
                 raise ValueError(
-                    f"{item.name} (seed {item.seed}), {_DRAWS} draws in vain; the last: {error}"
+                    f"{item.name} (seed {item.seed}): all {_DRAWS} draws failed; the last one: {error}"
                 ) from error
         else:
             return scenario
@@ -176,7 +182,7 @@ def item_scenario(item: Item) -> Scenario:
 
 
 def make_item(item: Item, folder: Path) -> Made:
-    """Simulate one recording and write it; it appears whole or not at all."""
+    """Simulate one recording and write it. It appears complete or not at all."""
     start = time.perf_counter()
     path = item.path(folder)
     if item.suite.story == PLANAR:

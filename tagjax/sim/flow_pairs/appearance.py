@@ -1,4 +1,4 @@
-"""What the layers of a flow pair look like: procedural textures or photographs, light, lens and sensor."""
+"""Appearance of the layers of a flow pair: procedural textures or photographs, light, lens and sensor."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _OCTAVES = np.array(
 
 
 class Surface(eqx.Module):
-    """How layers are painted, as functions of their local frames in pixels. Colours are 0 to 1.
+    """Colours of layers as functions of their local frames in pixels. Colours are 0 to 1.
 
-    Leaves are (layers, ...) in a scene and planes (..., height, width) where each pixel has its own layer's.
+    Leaves are (layers, ...) in a scene, and planes (..., height, width) where each pixel has its own layer's values.
     """
 
     base: Float[Array, ...]  # 3 colours
@@ -38,7 +38,7 @@ class Surface(eqx.Module):
 def white_noise(shape: tuple[int, ...], *, key: PRNGKeyArray) -> UInt32[Array, ...]:
     """Random words by hashing their numbers (Wellons' lowbias32, twice, seeded by the key).
 
-    `jax.random` takes about 40 ns a word on a CPU core, a third of the whole pair; noise in pictures needs less.
+    `jax.random` takes about 40 ns per word on a CPU core, a third of the time of a pair; picture noise needs less quality.
     """
     seeds = jax.random.bits(key, (2,), jnp.uint32)
     words = jax.lax.iota(jnp.uint32, int(np.prod(shape))) * jnp.uint32(0x9E3779B9) + seeds[0]
@@ -112,7 +112,7 @@ def paint(
     if photographs is not None:
         count, height, width, _ = photographs.shape
         scale = surface.photo[2]
-        # Mirrored at its edges, a photograph repeats without seams.
+        # A photograph mirrored at its edges repeats without seams.
         u = jnp.abs((x * scale + surface.photo[3] * width) % (2 * width - 2) - (width - 1))
         v = jnp.abs((y * scale + surface.photo[4] * height) % (2 * height - 2) - (height - 1))
         start = jnp.clip(surface.photo[1] * count, 0, count - 1).astype(jnp.int32)[None] * (height * width)
@@ -157,7 +157,7 @@ def sensor_noise(
 ) -> Float[Array, "height width 3"]:
     """Add shot noise: standard deviation `level` at white, less in the dark; clipped to 0 to 1."""
     bits = white_noise(image.shape, key=key)
-    # The sum of a word's four bytes is near enough to a Gaussian, at a quarter of the cost of one.
+    # The sum of a word's four bytes is close to a Gaussian, at a quarter of its cost.
     total = sum(((bits >> shift) & 255).astype(jnp.float32) for shift in (0, 8, 16, 24))
     gauss = (total - 510.0) / 147.8
     return jnp.clip(image + level * jnp.sqrt(0.1 + 0.9 * jnp.clip(image, 0.0, 1.0)) * gauss, 0.0, 1.0)

@@ -1,9 +1,9 @@
 """Layers of a flow pair: random smooth outlines and motions that have an inverse in closed form.
 
-Points are pixels from the middle of the picture, x right, y down. A layer's local frame is turned and centred on it;
-in it live its outline and its texture, both as they are in the first picture. All motions are written as displacements,
-so that what is still is displaced by exactly zero. Everything is elementwise: a parameter is a scalar (one layer, all
-pixels) or an array of the points' shape (each pixel its own layer's).
+Points are pixels from the centre of the picture, x right, y down. A layer's local frame is centred on the layer and
+rotated; outline and texture are defined in it, as in the first picture. All motions are written as displacements, so
+that static layers are displaced by exactly zero. Everything is elementwise: a parameter is a scalar (one layer, all
+pixels) or an array of the points' shape (the values of each pixel's layer).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Camera(eqx.Module):
 class Motion(eqx.Module):
     """A layer's own motion: two shears that bend it, then an affine map, in its local frame.
 
-    x += amplitude sin(rate y + phase), then y likewise by the new x: whatever the amplitudes, each step has an exact
-    inverse, and so has the whole.
+    x += amplitude sin(rate y + phase), then y likewise with the new x: for any amplitude each step has an exact inverse,
+    and so has the whole motion.
     """
 
     centre_x: Float[Array, "*points"]
@@ -55,14 +55,14 @@ class Motion(eqx.Module):
 
 
 class Outline(eqx.Module):
-    """What a layer covers of its local frame, as one of four families of shapes."""
+    """The area that a layer covers in its local frame, as one of four families of shapes."""
 
     kind: Float[Array, "*layer"]  # 0 superellipse, 1 blob, 2 polygon, 3 limb of two bars
     exists: Float[Array, "*layer"]
     half_x: Float[Array, "*layer"]
     half_y: Float[Array, "*layer"]
     power: Float[Array, "*layer"]  # of the superellipse: 1, 2 or 3 for |x|^2, |x|^4, |x|^8
-    rim: Float[Array, "*layer"]  # width of the ring that is left of a hollow shape; 0 = full
+    rim: Float[Array, "*layer"]  # width of the ring of a hollow shape; 0 = filled
     thickness: Float[Array, "*layer"]  # radius of the limb's bars
     elbow: Float[Array, ...]  # (2,) cosine, sine of the angle between them
     harmonics: Float[Array, ...]  # (orders, 2) cosine and sine parts of orders 2, 3, ... of the blob's radius
@@ -85,7 +85,7 @@ def make_camera(shift: Float[Array, 2], turn: Float[Array, ""], zoom: Float[Arra
 
 
 def camera_displacement(camera: Camera, points: Points, *, back: bool) -> Points:
-    """By how much the camera's motion (or its inverse) displaces points."""
+    """Displacement of points by the camera's motion, or by its inverse."""
     matrix = camera.back if back else camera.ahead
     x, y = points
     u, v = x / camera.half_px, y / camera.half_px
@@ -102,7 +102,7 @@ def to_local(motion: Motion, points: Points) -> Points:
 
 
 def wave(x: Float[Array, ...]) -> Float[Array, ...]:
-    """The sine to 0.001 by two parabolas: smooth, and several times faster on a CPU than the exact one."""
+    """The sine to within 0.001 by two parabolas: smooth, and several times faster on a CPU than the exact sine."""
     turns = x * (1 / (2 * np.pi))
     t = 2 * (turns - jnp.floor(turns)) - 1
     bow = -4 * t * (1 - jnp.abs(t))
@@ -130,9 +130,9 @@ def _local_back(m: Motion, x: Array, y: Array) -> Points:
 
 
 def displacement(camera: Camera, motion: Motion, points: Points, *, back: bool) -> Points:
-    """Where points of the first picture go in the second, or where (`back`) points of the second come from.
+    """Displacement of points of the first picture to the second, or with `back` of points of the second to the first.
 
-    The layer moves on its own, then the camera moves it with all others.
+    The layer moves first, then the camera moves all layers.
     """
     x, y = points
     cx, cy = camera_displacement(camera, points, back=True) if back else (jnp.zeros_like(x), jnp.zeros_like(y))

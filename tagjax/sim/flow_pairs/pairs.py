@@ -1,7 +1,7 @@
 """Pairs of pictures with exact optical flow, drawn on the device: textured layers that move over a background.
 
 For pre-training a flow network (after FlyingChairs, Dosovitskiy et al., ICCV 2015, and AutoFlow, Sun et al., CVPR
-2021), with what a still indoor camera sees: much that does not move at all, many small motions, limbs, dull walls.
+2021), adapted to static indoor cameras: large static areas, many small motions, limbs, walls with little texture.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["FlowPair", "FlowPairSettings", "flow_pair", "flow_pairs"]
 class FlowPair(eqx.Module):
     """Two pictures and the exact motion between them, both ways. Leading axes where several are stacked.
 
-    Occluded is a pixel whose target in the other picture is hidden by a nearer layer or lies outside.
+    A pixel is occluded if its target in the other picture is hidden by a nearer layer or lies outside.
     """
 
     first: Float[Array, "*batch height width 3"]  # 0 to 1
@@ -37,15 +37,15 @@ class FlowPair(eqx.Module):
 
 
 def _nearest(holds: Bool[Array, "layers height width"]) -> Int[Array, "height width"]:
-    """Number of the nearest layer that holds, from 1; 0 for the background."""
+    """Number of the nearest layer where `holds` is true, from 1; 0 for the background."""
     numbers = jnp.arange(1, holds.shape[0] + 1, dtype=jnp.int32).reshape(-1, 1, 1)
     return jnp.max(jnp.where(holds, numbers, 0), axis=0)
 
 
 def _rows(leaves, number: Int[Array, "height width"]):
-    """Each pixel's own layer's parameters: of leaves (layers, ...), planes (..., height, width).
+    """The parameters of each pixel's layer: leaves (layers, ...) become planes (..., height, width).
 
-    A product with one-hot columns: on CPUs several times faster than a gather, and in full precision as exact.
+    A product with one-hot columns: several times faster than a gather on CPUs, and exact in full precision.
     """
     flat, structure = jax.tree.flatten(leaves)
     table = jnp.concatenate([leaf.reshape(len(leaf), -1) for leaf in flat], axis=1)
@@ -63,7 +63,7 @@ def _foreground(scene: Scene) -> tuple[Int[Array, " layers"], geometry.Outline, 
 
 
 def _came_from(scene: Scene, motion: geometry.Motion, points: geometry.Points) -> geometry.Points:
-    """The points of the first picture that a layer carries to `points` of the second."""
+    """The points of the first picture that a layer moves to `points` of the second."""
     dx, dy = geometry.displacement(scene.camera, motion, points, back=True)
     return points[0] + dx, points[1] + dy
 
@@ -76,14 +76,14 @@ def _outlines(scene: Scene, points: geometry.Points) -> tuple[Float[Array, "laye
         places = (points, _came_from(scene, motion, points))
         return tuple(geometry.outline_value(outline, geometry.to_local(motion, place)) for place in places)
 
-    # A loop over layers, here and below: XLA would fuse an unrolled one into each of its uses, and compile it longer.
+    # A loop over layers, here and below: XLA would fuse an unrolled one into each of its uses and compile longer.
     return jax.lax.map(one, _foreground(scene))
 
 
 def _occluded(
     scene: Scene, labels: tuple[Int[Array, "height width"], ...], targets: tuple[geometry.Points, ...]
 ) -> tuple[Bool[Array, "height width"], ...]:
-    """Whether a nearer layer covers a pixel's target, or it is beyond the area of the other picture's pixels."""
+    """Whether a nearer layer covers a pixel's target, or the target lies outside the other picture."""
     height, width = labels[0].shape
     outside = tuple((jnp.abs(x) > width / 2) | (jnp.abs(y) > height / 2) for x, y in targets)
 
@@ -103,7 +103,7 @@ def _pictures(
     atlas: Array,
     photographs: Array | None,
 ) -> Float[Array, "2 height width 3"]:
-    """Colours of both pictures; at an edge, each of two layers has its fraction of the pixel."""
+    """Colours of both pictures. At an edge, two layers are blended by their fractions of the pixel."""
     numbers = jnp.arange(1, len(values[0]) + 1, dtype=jnp.int32).reshape(-1, 1, 1)
     tops, unders, fractions = [], [], []
     for value in values:
@@ -130,7 +130,7 @@ def _pictures(
 def _develop(
     first: Array, second: Array, points: geometry.Points, settings: FlowPairSettings, key: PRNGKeyArray
 ) -> tuple[Array, Array]:
-    """Light, lens and sensor: the light may change between the pictures; blur and noise are one camera's."""
+    """Light, lens and sensor: the light may change between the pictures; blur and noise are those of one camera."""
     draw_key, *noise_keys = jax.random.split(key, 3)
     u = jax.random.uniform(draw_key, (16,))
     varies = (u[0] < settings.lighting_change_probability).astype(jnp.float32)
@@ -157,8 +157,8 @@ def flow_pair(
 ) -> FlowPair:
     """One random pair with exact flow and occlusion, both ways; the same for the same key. `vmap` over keys.
 
-    `photographs` (0 to 1, or uint8) are pasted on a fraction of the layers, one of their pixels to about one of ours.
-    Flow is the layers' motion in closed form, in either direction: exact but for float32 (about 1e-4 px).
+    `photographs` (0 to 1, or uint8) are drawn on a fraction of the layers, at about their own resolution. Flow is the
+    layers' motion in closed form in both directions: exact up to float32 (about 1e-4 px).
     """
     scene_key, atlas_key, camera_key = jax.random.split(key, 3)
     scene, atlas = draw_scene(settings, key=scene_key), look.make_atlas(key=atlas_key)

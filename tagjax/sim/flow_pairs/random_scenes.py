@@ -1,4 +1,4 @@
-"""Random scenes for flow pairs: settings, and the draw of camera, motions, outlines and surfaces from one key."""
+"""Random scenes for flow pairs: settings, and random camera, motions, outlines and surfaces from one key."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _SIZES = ("turn_rad", "zoom", "bend_px", "camera_turn_rad", "camera_zoom", "came
 
 @dataclasses.dataclass(frozen=True)
 class FlowPairSettings:
-    """What pairs to draw: `*_share` are probabilities, two numbers a range, a single one the largest magnitude.
+    """Distribution of the pairs. Two numbers are a range; a single size is the largest magnitude.
 
-    Lengths of motion and radii are log-uniform in their range; turns, zooms, tilts and bends are uniform numbers
-    cubed, so mostly small. Raises `ValueError` for values that make no picture.
+    Lengths of motion and radii are log-uniform in their range; rotations, zooms, tilts and bends are cubes of uniform
+    numbers, so mostly small. Raises `ValueError` for impossible values.
     """
 
     height: int = 128
@@ -45,9 +45,9 @@ class FlowPairSettings:
     camera_tilt: float = 0.04  # perspective: relative change of scale at the picture's left or right edge
     static_camera_probability: float = 0.5
     static_scene_probability: float = 0.05  # nothing moves
-    low_texture_probability: float = 0.25  # layers with next to no texture
-    photo_probability: float = 0.5  # layers that show a photograph, where there are any
-    lighting_change_probability: float = 0.5  # pairs whose light changes between the pictures
+    low_texture_probability: float = 0.25  # of a layer with almost no texture
+    photo_probability: float = 0.5  # of a layer with a photograph, where photographs are given
+    lighting_change_probability: float = 0.5  # of a change of light between the pictures
     gain: float = 0.2
     offset: float = 0.05
     gamma: float = 0.2
@@ -57,10 +57,10 @@ class FlowPairSettings:
 
     def __post_init__(self) -> None:
         if min(self.height, self.width) < 16:
-            raise ValueError(f"Pictures of {self.height} x {self.width} are too small; use at least 16 x 16.")
+            raise ValueError(f"height and width are {self.height} and {self.width}; expected at least 16 pixels each.")
         low, high = self.num_layers
         if not 1 <= low <= high:
-            raise ValueError(f"num_layers is {self.num_layers}; expected 1 <= fewest <= most.")
+            raise ValueError(f"num_layers is {self.num_layers}; expected 1 <= smallest <= largest.")
         for name in _PROBABILITIES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected a probability from 0 to 1.")
@@ -73,29 +73,31 @@ class FlowPairSettings:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected a finite number of at least 0.")
         for name, limit in {"zoom": 0.6, "camera_zoom": 0.6, "camera_tilt": 0.25, "gamma": 0.9, "gain": 0.9}.items():
             if getattr(self, name) > limit:
-                raise ValueError(f"{name} is {getattr(self, name)}; beyond {limit} pictures degenerate.")
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}; expected at most {limit}, beyond which pictures degenerate."
+                )
 
 
 class Scene(eqx.Module):
-    """Everything drawn for a pair but its pixels. Rows are layers, the background first, nearer ones later."""
+    """All random parameters of a pair. Rows are layers, the background first, then from far to near."""
 
     camera: geometry.Camera
     motion: geometry.Motion
-    outline: geometry.Outline  # one row fewer: the background is everywhere
+    outline: geometry.Outline  # one row fewer: the background covers everything
     surface: look.Surface
 
 
 class _Draws:
-    """Hands out the rows of a table of uniform numbers, each once."""
+    """Returns the rows of a table of uniform numbers, each once."""
 
     def __init__(self, table: Array):
         self._table, self._used = table, 0
 
     def __call__(self, *shape: int) -> Array:
-        """The next row, or as many as fill `shape`, which comes before the rows' own axes."""
+        """The next row, or as many rows as fill `shape`, whose axes precede those of a row."""
         count = int(np.prod(shape))
         if self._used + count > len(self._table):
-            raise ValueError(f"More than {len(self._table)} uniform numbers are drawn; raise _NUM_ROWS.")
+            raise ValueError(f"More than {len(self._table)} uniform numbers are needed; increase _NUM_ROWS.")
         rows = self._table[self._used : self._used + count]
         self._used += count
         return rows.reshape(*shape, *self._table.shape[1:])
@@ -121,12 +123,12 @@ def _draw_camera(settings: FlowPairSettings, draws: _Draws, still: Array) -> tup
 
 def _draw_motion(settings: FlowPairSettings, draws: _Draws, fixed: Array, radius: Array,
                  camera_shift: Array) -> geometry.Motion:  # fmt: skip
-    """`fixed` layers do not move over the background, whatever the rest says."""
+    """Motion of all layers. `fixed` layers do not move relative to the background."""
     moves = jnp.where(fixed, 0.0, 1.0)
     heading = 2 * np.pi * draws()
     cosine, sine = jnp.cos(heading), jnp.sin(heading)
     length, angle = moves * _log_uniform(draws(), settings.motion_px), 2 * np.pi * draws()
-    # What is nearer than the background moves further when the camera shifts.
+    # Layers nearer than the background move farther when the camera shifts.
     parallax = moves * draws()
     shift_x = length * jnp.cos(angle) + parallax * (cosine * camera_shift[0] + sine * camera_shift[1])
     shift_y = length * jnp.sin(angle) + parallax * (cosine * camera_shift[1] - sine * camera_shift[0])
@@ -142,7 +144,7 @@ def _draw_motion(settings: FlowPairSettings, draws: _Draws, fixed: Array, radius
 
     def bend() -> tuple[Array, Array, Array]:
         rate = 2 * np.pi / ((1.5 + 3 * draws()) * radius)
-        # A slope of at most 0.6: beyond it a bend looks like tearing.
+        # A slope of at most 0.6: a stronger bend looks like tearing.
         amplitude = jnp.clip(_mostly_small(draws(), settings.bend_px), -0.6 / rate, 0.6 / rate)
         return bends * amplitude, rate, 2 * np.pi * draws()
 
@@ -176,7 +178,7 @@ def _draw_surface(settings: FlowPairSettings, draws: _Draws, radius: Array) -> l
         return (1 - saturation) * draws(1) + saturation * draws(3)
 
     base = 0.08 + 0.84 * colour(0.35)
-    # Most layers show one or two of the fields plainly, some next to nothing.
+    # Most layers show one or two of the fields clearly, some almost nothing.
     largest = jnp.asarray([0.35, 0.2, 0.25, 0.3]).reshape(-1, 1)
     strength = draws(look.NUM_FIELDS) ** 3 * largest
     strength = jnp.where(draws(1) < settings.low_texture_probability, 0.06 * strength, 0.03 + strength)

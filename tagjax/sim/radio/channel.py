@@ -1,4 +1,4 @@
-"""The radio channel of a backscatter link: line of sight, images in planes, single bounces off bodies and metal.
+"""The radio channel of a backscatter link: line of sight, image sources of planes, single reflections off scatterers.
 
 One way, h = sum_i a_i exp(-2j pi f d_i / c) over the paths i from the antenna to the tag; there and back over the same
 antenna, H = h^2. Every function takes one tag, antenna and carrier: `jax.vmap` for more. All are differentiable.
@@ -21,26 +21,26 @@ MIN_DISTANCE_M = 0.05
 """Amplitudes stop growing below this: lambda / (2 pi), where the far field of a UHF antenna begins."""
 
 EDGE_M = 0.1
-"""Width over which a reflection fades at the edge of its rectangle. A hard edge would make phases jump and carry no
-gradient; diffraction fades it over a Fresnel zone, 0.3 m and more, so this is still on the sharp side."""
+"""Width over which a reflection fades at the edge of its rectangle. A hard edge would cause phase jumps and have no
+gradient; diffraction fades it over a Fresnel zone, 0.3 m and more, so 0.1 m is still rather sharp."""
 
 NULL_DB = 20.0
-"""What a tag that points its end at the antenna loses in RSSI (null of a dipole in a room: up to 20 dB)."""
+"""RSSI loss of a tag whose dipole points at the antenna (null of a dipole in a room: up to 20 dB)."""
 
 BEAM_POWER = 7.3
 BACK_DB = 20.0
 """A reader's patch antenna of 9 dBic: gain cos^(2 * BEAM_POWER)(angle / 2), half at 35 degrees off its axis, and
-`BACK_DB` less behind (assumed). Gain and width agree: such a beam's directivity is BEAM_POWER + 1, 9.2 dB."""
+`BACK_DB` less behind (assumed). Gain and beam width are consistent: the directivity is BEAM_POWER + 1, 9.2 dB."""
 
 REFLECTION = (0.3, 0.8)
 """Sizes of reflection coefficients of 2 to 6 images that give the phase ripple of the logs (0.13 to 0.23 rad)."""
 
 NO_SIGNAL_DBM = -200.0
-"""RSSI where no path is left: far below any receiver, and finite."""
+"""RSSI where no path remains: far below any receiver's sensitivity, and finite."""
 
 
 def _phasor(path_m: Float[Array, "*shape"], carrier_hz: Float[Array, ""]) -> Complex[Array, "*shape"]:
-    """exp(-2j pi f d / c). Whole wavelengths go first: x - floor(x) is exact, a large angle's rounding is not."""
+    """exp(-2j pi f d / c). Whole wavelengths are subtracted first: that is exact, while rounding a large angle is not."""
     wavelengths = path_m * (carrier_hz / SPEED_OF_LIGHT_M_S)
     angle = -2 * jnp.pi * wrap_to_pi(wavelengths, 1.0)
     return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
@@ -73,7 +73,7 @@ def patch_amplitude(ray: Float[Array, "*paths 3"], boresight: Float[Array, " 3"]
     A zero `boresight` is isotropic.
     """
     ahead = _dot(_unit(ray), jnp.broadcast_to(boresight, ray.shape))
-    # A tag at the antenna itself lies in no direction: it counts as ahead, and (0)^p is kept from its gradient.
+    # A tag at the antenna itself has no direction: treated as ahead, which keeps 0^p out of the gradient.
     isotropic = (_dot(boresight, boresight) == 0) | ~jnp.any(ray != 0, axis=-1)
     half_angle = jnp.where(isotropic, 1.0, jnp.clip(0.5 * (1.0 + ahead), 1e-6, 1.0))
     floor = 10.0 ** (-BACK_DB / 10)
@@ -83,10 +83,10 @@ def patch_amplitude(ray: Float[Array, "*paths 3"], boresight: Float[Array, " 3"]
 def plane_paths(
     tag_m: Float[Array, " 3"], antenna_m: Float[Array, " 3"], planes: Planes
 ) -> tuple[Float[Array, "planes 3"], Float[Array, " planes"]]:
-    """Rays from the antenna's mirror images to the tag, metres, and how much of each meets its rectangle, 0 to 1.
+    """Rays from the antenna's mirror images to the tag, metres, and the fraction of each that its rectangle reflects.
 
     The image of a in the plane n . x = b is a - 2 (n . a - b) n (Allen and Berkley, 1979); its path is the reflected
-    one. There is none where antenna and tag lie on different sides.
+    one. There is no reflection where antenna and tag lie on different sides.
     """
     side_antenna = _dot(planes.normal, antenna_m[None] - planes.centre_m)
     side_tag = _dot(planes.normal, tag_m[None] - planes.centre_m)
@@ -103,10 +103,10 @@ def plane_paths(
 def scatter_points(
     tag_m: Float[Array, " 3"], antenna_m: Float[Array, " 3"], scatterers: Scatterers
 ) -> Float[Array, "scatterers 3"]:
-    """Where each scatterer reflects, metres: the point that makes the path shortest (Fermat).
+    """The reflection point of each scatterer, metres: the point of the shortest path (Fermat).
 
-    On a cylinder's axis by unfolding: heights weighted by the other end's distance from the axis; then out to the
-    surface along the bisector of the two rays, which is exact at equal distances and close far away.
+    On a cylinder's axis by unfolding: heights weighted by the other end's distance from the axis; then moved to the
+    surface along the bisector of the two rays, which is exact at equal distances and accurate far away.
     """
     axis, centre = scatterers.axis, scatterers.position_m
     height, across = [], []
@@ -168,7 +168,7 @@ def one_way_gain(
 
 
 def two_way_gain(one_way: Complex[Array, "*batch"]) -> Complex[Array, "*batch"]:
-    """Gain there and back over one antenna: h^2, the link being reciprocal."""
+    """Gain there and back over one antenna: h^2, as the link is reciprocal."""
     return one_way * one_way
 
 
@@ -184,10 +184,10 @@ def reported_phase_rad(two_way: Complex[Array, "*batch"], *, phase_sign: int = 1
 def rssi_from_gain_dbm(
     two_way: Complex[Array, "*batch"], *, at_1m_dbm: Float[Array, ""] | float = RSSI_AT_1M_DBM
 ) -> Float[Array, "*batch"]:
-    """RSSI, dBm: 20 log10 |H| + `at_1m_dbm`, the set-up's value in free space at 1 m (power, gains, chip).
+    """RSSI, dBm: 20 log10 |H| + `at_1m_dbm`, the value in free space at 1 m (power, gains, chip).
 
-    Free space falls by 40 dB a decade. `NO_SIGNAL_DBM` at the least, where the gradient is 0.
+    In free space it falls by 40 dB per decade. The minimum is `NO_SIGNAL_DBM`, where the gradient is 0.
     """
     magnitude = safe_sqrt(two_way.real**2 + two_way.imag**2)
-    least = 10.0 ** (-9)
-    return jnp.maximum(20 * jnp.log10(jnp.maximum(magnitude, least)) + at_1m_dbm, NO_SIGNAL_DBM)
+    smallest = 10.0 ** (-9)
+    return jnp.maximum(20 * jnp.log10(jnp.maximum(magnitude, smallest)) + at_1m_dbm, NO_SIGNAL_DBM)

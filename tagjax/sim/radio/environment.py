@@ -1,4 +1,4 @@
-"""What reflects a radio wave: flat panels of a room, and compact scatterers such as bodies."""
+"""Reflectors of radio waves: flat panels of a room, and compact scatterers such as people."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Environment(eqx.Module):
 
 
 def room_environment(panels: Sequence[Panel], num_people: int) -> Environment:
-    """The room's reflectors, and a cylinder for each person (placed by the path given with it)."""
+    """The room's reflectors, and one cylinder per person at the origin (its path is given to the inventory)."""
     rows = [(p.centre_m, p.normal, p.along, p.half_size_m, p.reflection) for p in panels]
     centre, normal, along, half, reflection = zip(*rows, strict=True) if rows else ((), (), (), (), ())
     shape = (len(rows), 3)

@@ -1,4 +1,4 @@
-"""The channel between the antennas and moving tags of one set-up: at given answers, and who is within reach when."""
+"""The radio links between antennas and moving tags: at the times of replies, and which tags are in range when."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .channel import one_way_gain, reported_phase_rad, rssi_from_gain_dbm, two_w
 from .environment import Environment
 
 REACH_EVERY_S = 0.1
-"""Between looks at which tags an antenna hears: half a dwell."""
+"""Sampling period of which tags are in an antenna's range: half a dwell."""
 
 
 @eqx.filter_jit
@@ -43,7 +43,7 @@ def link_gains(
 
 @dataclasses.dataclass(frozen=True)
 class Links:
-    """What the channel makes of answers, of those whose place is known."""
+    """The radio links of replies whose tag position is known; one row a reply."""
 
     time_s: np.ndarray
     tag: np.ndarray
@@ -57,7 +57,7 @@ class Links:
 
 @dataclasses.dataclass(frozen=True)
 class SetUp:
-    """Everything that the channel between antennas and tags depends on; by tag where there is a list."""
+    """Everything that the channel between antennas and tags depends on. Lists have one element per tag."""
 
     paths: tuple[Track, ...]
     antennas_m: np.ndarray
@@ -71,7 +71,7 @@ class SetUp:
     scatterer_path: tuple[np.ndarray, np.ndarray] | None
 
     def links(self, time_s: np.ndarray, tag: np.ndarray, antenna: np.ndarray) -> Links:
-        """The links at some times, of tags and antennas given by number; where a path is not known they are left out."""
+        """The links at given times of tags and antennas given by index. Times without a known tag position are left out."""
         position, passed = np.full((len(time_s), 3), np.nan), np.ones(len(time_s))
         axis = np.zeros((len(time_s), 3))
         for number, (path, factor, dipole) in enumerate(zip(self.paths, self.transmission, self.dipole, strict=True)):
@@ -97,19 +97,19 @@ class SetUp:
         )
         return Links(time_s, tag, antenna, channel, position, passed, phase, rssi + self.rssi_at_1m_dbm)
 
-    def within_reach(self, start_s: float, stop_s: float, least_dbm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Times, and which tags each antenna hears from each time on, (samples, tags, antennas)."""
+    def tags_in_range(self, start_s: float, stop_s: float, min_dbm: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times, and which tags are in each antenna's range from each time on, (samples, tags, antennas)."""
         when = np.arange(start_s, stop_s, REACH_EVERY_S)
         shape = (len(when), len(self.paths), len(self.antennas_m))
         sample, tag, antenna = (grid.ravel() for grid in np.indices(shape))
         link = self.links(when[sample], tag, antenna)
         in_range = np.zeros(shape, bool)
         at = np.searchsorted(when, link.time_s)
-        in_range[at, link.tag, link.antenna] = link.rssi_dbm >= least_dbm
+        in_range[at, link.tag, link.antenna] = link.rssi_dbm >= min_dbm
         return when, in_range
 
     def speed_m_s(self, time_s: np.ndarray, tag: np.ndarray, antenna: np.ndarray) -> np.ndarray:
-        """Rate of each range; 0 at a path's very ends, where it is not known."""
+        """Rate of change of each range; 0 at the ends of a path, where it is unknown."""
         speed = np.zeros(len(time_s))
         for number, path in enumerate(self.paths):
             mine = np.flatnonzero(tag == number)
@@ -129,12 +129,12 @@ def interpolate(when, time_s, values) -> np.ndarray:
 
 
 def _padded_gains(environment, *columns) -> tuple[np.ndarray, np.ndarray]:
-    """`link_gains` of any number of reads, padded to a power of two so that few sizes are ever compiled."""
+    """`link_gains` of any number of reads, padded to a power of two so that few sizes are compiled."""
     count = len(columns[0])
     if count == 0:
         return np.zeros(0), np.zeros(0)
     size = max(256, 1 << (count - 1).bit_length())
-    # The last read is repeated: a row of zeros would put a tag onto its antenna.
+    # The last read is repeated: a row of zeros would place a tag at its antenna.
     rows = np.minimum(np.arange(size), count - 1)
     phase, rssi = link_gains(environment, *(jnp.asarray(np.asarray(c)[rows], jnp.float32) for c in columns))
     return np.asarray(phase, float)[:count], np.asarray(rssi, float)[:count]

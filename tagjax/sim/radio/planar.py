@@ -20,7 +20,7 @@ _ARRAYS = ("line_m", "sample_m", "phase_rad", "phase_offset_rad")
 
 @dataclasses.dataclass(frozen=True)
 class PlanarSettings:
-    """Geometry of the figure; `noise_rad` is ours (the paper says white Gaussian, not how much)."""
+    """Geometry of the figure. `noise_rad` is our choice: the paper gives white Gaussian noise without a level."""
 
     num_lines: int = 101
     spacing_m: float = 0.006
@@ -42,19 +42,19 @@ class PlanarSettings:
 
 @dataclasses.dataclass(frozen=True)
 class PlanarTrials:
-    """What every round measured. Line k is x = line_m[k]; the tag is on line `true_line`."""
+    """The measurements of every round. Line k is x = line_m[k]; the tag is on line `true_line`."""
 
     line_m: Float[np.ndarray, " lines"]
     sample_m: Float[np.ndarray, "rounds samples"]  # y of each sample, the same on every line
     phase_rad: Float[np.ndarray, "rounds samples"]  # in [0, 2 pi), without any offset
-    phase_offset_rad: Float[np.ndarray, " rounds"]  # what a real reader adds: add it, modulo 2 pi, for that case
+    phase_offset_rad: Float[np.ndarray, " rounds"]  # of a real reader: add it, modulo 2 pi, to include it
     true_line: int
     antenna_m: tuple[float, float]
     carrier_hz: float
 
 
 def planar_trials(settings: PlanarSettings | None = None, *, seed: int) -> PlanarTrials:
-    """Draw every round's samples and phases."""
+    """Draw the samples and phases of every round."""
     settings = settings or PlanarSettings()
     rng = np.random.default_rng(seed)
     line = (np.arange(settings.num_lines) - settings.num_lines // 2) * settings.spacing_m
@@ -76,7 +76,7 @@ def planar_trials(settings: PlanarSettings | None = None, *, seed: int) -> Plana
 
 
 def save_planar(trials: PlanarTrials, path: Path) -> None:
-    """Write trials as a Zarr group; its attributes, which make it readable, come last."""
+    """Write trials as a Zarr group. The attributes are written last: without them the group is unreadable."""
     root = zarr.open_group(str(path), mode="w", zarr_format=3)
     for name in _ARRAYS:
         values = getattr(trials, name)
@@ -92,7 +92,7 @@ def save_planar(trials: PlanarTrials, path: Path) -> None:
 
 
 def open_planar(path: str | Path) -> PlanarTrials:
-    """Read trials. Raises `RecordingError` for what holds none, or not all."""
+    """Read trials. Raises `RecordingError` where arrays or attributes are missing or unreadable."""
     try:
         root = zarr.open_group(str(path), mode="r", zarr_format=3)
         attributes: dict[str, Any] = dict(root.attrs)

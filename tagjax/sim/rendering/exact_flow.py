@@ -1,4 +1,4 @@
-"""Exact optical flow between two casts, forward and backward, with what is hidden either way."""
+"""Exact optical flow between two casts, forward and backward, with occlusion in both directions."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from .viewpoint import view_key
 
 @dataclasses.dataclass(frozen=True)
 class FlowTruth:
-    """Flow in pixels (x right, y down) and occlusion: True where a pixel's point is not in the other picture.
+    """Flow in pixels (x right, y down) and occlusion: True where a pixel's point is not visible in the other picture.
 
-    Not in it: behind something else, turned away, or outside the frame. Nothing was hit: no flow, not occluded.
+    That is where it is behind another surface, turned away, or outside the frame. Pixels without a hit have no flow and
+    are not occluded.
     """
 
     forward_px: np.ndarray  # (height, width, 2) float32, of the first picture's pixels
@@ -24,7 +25,7 @@ class FlowTruth:
 
 
 def flow_between(before: Hits, after: Hits) -> FlowTruth:
-    """Flow both ways between two casts of one raycaster, at two poses, seen by one camera or by a camera that moved."""
+    """Forward and backward flow between two casts of one world at two poses, from one camera or a camera that moved."""
     if before.geom.shape != after.geom.shape or len(before.geom_position_m) != len(after.geom_position_m):
         raise ValueError(
             f"Casts of {before.geom.shape} pixels, {len(before.geom_position_m)} geoms and {after.geom.shape}, "
@@ -36,14 +37,14 @@ def flow_between(before: Hits, after: Hits) -> FlowTruth:
 
 
 def one_way_flow(source: Hits, target: Hits) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (height, width, 2) float32 of `source`'s pixels into `target`, and where it is occluded there.
+    """Flow (height, width, 2) float32 from `source`'s pixels to `target`, and where these are occluded in `target`.
 
-    Each hit point is carried along by its geom. As geoms are convex, a point is seen again if its surface faces the
-    camera and its geom is what one of the four pixels around its new place shows.
+    Each hit point moves with its geom. As geoms are convex, the point is visible if its surface faces the camera and one
+    of the four pixels around its new position shows its geom.
     """
     height, width = source.geom.shape
     flow = np.zeros((height, width, 2), np.float32)
-    # A pixel on a geom that did not move, seen by a camera that did not move, has no flow: most pixels.
+    # Most pixels lie on a geom that did not move, seen by a camera that did not move: zero flow.
     hidden = (target.geom != source.geom) & (source.geom >= 0)
     if view_key(source.view) == view_key(target.view):
         still = np.all(source.geom_position_m == target.geom_position_m, axis=1)

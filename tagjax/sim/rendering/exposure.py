@@ -15,10 +15,10 @@ _ADC_LEVELS = 4096
 
 @dataclasses.dataclass(frozen=True)
 class Illumination:
-    """How bright the room is, and what the camera makes of it: electrons = light * radiance * full well.
+    """Brightness of the room and the camera's response: electrons = light * radiance * full well.
 
-    Noise is shot noise (variance = electrons) and read noise, both lifted by the gain. Well and read noise are assumed,
-    of the order of a small CMOS sensor's with pixels of 2 to 3 um.
+    Noise is shot noise (variance = electrons) and read noise, both multiplied by the gain. Full well and read noise are
+    assumed, of the order of a small CMOS sensor with pixels of 2 to 3 um.
     """
 
     light: float
@@ -36,8 +36,8 @@ class Illumination:
     ) -> np.ndarray:
         """The picture, uint8 RGB, of linear light (height, width, 3): lens, noise, a 12-bit converter, gamma.
 
-        Shot noise is drawn as normal, which it nearly is from ten electrons on. The lens blurs by `blur_px` (standard
-        deviation), as one ray a pixel makes edges harder than any camera's.
+        Shot noise is drawn from a normal distribution, which is accurate from ten electrons on. The lens blurs by
+        `blur_px` (standard deviation), because one ray per pixel makes edges sharper than those of any camera.
         """
         light = np.asarray(radiance, np.float32) * np.float32(exposure)
         if blur_px > 0:
@@ -59,9 +59,9 @@ ILLUMINATION = {
     "dim": Illumination(light=0.15, gain=3.0),
     "dark": Illumination(light=0.02, gain=8.0),
 }
-"""Lamps on; one lamp far away; curtains drawn and lamps off. The camera's gain makes up for part of it only."""
+"""Lamps on; one lamp far away; curtains drawn and lamps off. The camera's gain compensates only a part of it."""
 
 
 def auto_exposure(radiance: np.ndarray, *, white: float = 0.8, fraction: float = 0.95) -> float:
-    """The exposure that puts a fraction of a picture's values below `white`; of the first frame, at bright light."""
+    """The exposure at which a fraction of the picture's values lies below `white`; set by the first frame in bright light."""
     return float(white / max(np.quantile(radiance[::4, ::4], fraction), 1e-3))

@@ -11,7 +11,7 @@ from .viewpoint import Viewpoint
 
 @dataclasses.dataclass(frozen=True)
 class Hits:
-    """What every pixel's ray meets, and where every geom was then (so that flow needs no second posing)."""
+    """The first surface on every pixel's ray, and the pose of every geom at that time, which exact flow needs."""
 
     view: Viewpoint
     geom: np.ndarray  # (height, width) int32, -1 = nothing

@@ -1,6 +1,6 @@
-"""A world as a MuJoCo model, posed at any time and seen by ray casting. Needs the `sim` extra.
+"""Ray casting of a world, as a MuJoCo model that is posed at any time. Needs the `sim` extra.
 
-What never moves is cast once a viewpoint; later frames cast only the rays that may meet what moves.
+Static bodies are cast once per viewpoint; later frames cast only the rays that may hit moving bodies.
 """
 
 # MuJoCo's names come from a compiled module that the type checker cannot read.
@@ -27,7 +27,7 @@ except ImportError as error:  # pragma: no cover - depends on the installation
     ) from error
 
 FAR_M = 60.0
-"""Nothing farther away is seen."""
+"""Length of the rays: nothing farther away is visible."""
 
 _SHADOW_GAP_M = 0.003
 _MAX_VIEWS = 4
@@ -36,7 +36,7 @@ _STATIC, _MOVING = (np.array([on, not on, 0, 0, 0, 0], np.uint8) for on in (True
 
 @functools.lru_cache(maxsize=16)
 def _lens(k: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Unit rays (pixels, 3) in the camera frame, and the cosine that turns distance into z; distortion is not made."""
+    """Unit rays (pixels, 3) in the camera frame, and the cosine that converts distance into z. Without lens distortion."""
     x, y = np.meshgrid((np.arange(k.width) - k.cx_px) / k.fx_px, (np.arange(k.height) - k.cy_px) / k.fy_px)
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=-1)
     cosine = 1 / np.linalg.norm(rays, axis=-1)
@@ -44,7 +44,7 @@ def _lens(k: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Raycaster:
-    """A world compiled once. Geoms are numbered anew: `geom_body`, `geom_label`, `geom_shape` say what each is."""
+    """A compiled world. MuJoCo numbers its geoms in its own order: see `geom_body`, `geom_label` and `geom_shape`."""
 
     def __init__(self, world: World):
         world.check()
@@ -86,7 +86,7 @@ class Raycaster:
         return tuple(shape.material for shape in self.geom_shape)
 
     def pose(self, step: SupportsFloat) -> None:
-        """Move everything to where it is at a step; between two steps, interpolated."""
+        """Move all bodies to their poses at a step; poses between two steps are interpolated."""
         step = min(max(float(step), 0.0), self.world.num_steps - 1.0)
         self.step = step
         first = int(step)
@@ -102,7 +102,7 @@ class Raycaster:
         mujoco.mj_kinematics(self.model, self.data)
 
     def cast(self, view: Viewpoint) -> Hits:
-        """What a camera sees of the world as it is posed, one ray a pixel."""
+        """Cast one ray per pixel through the world in its present pose."""
         rays, static = self._background(view)
         position, rotation = self.data.geom_xpos.copy(), self.data.geom_xmat.reshape(-1, 3, 3).copy()
         shape = static.geom.shape
@@ -135,18 +135,19 @@ class Raycaster:
         )
 
     def background(self, view: Viewpoint) -> Hits:
-        """What a camera sees of the bodies that never move; the same object at every call, so caches may hold it."""
+        """The cast of the static bodies alone. Every call returns the same object, so caches may keep it."""
         return self._background(view)[1]
 
     def labels(self, hits: Hits) -> np.ndarray:
-        """Label mask of a cast, uint8 (height, width); 0 is the room, and nothing."""
+        """Label mask of a cast, uint8 (height, width); 0 is the room, and pixels without a hit."""
         return np.where(hits.geom >= 0, self.geom_label[np.maximum(hits.geom, 0)], 0).astype(np.uint8)
 
     def lit(self, hits: Hits, light_m: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Which pixels of a cast of the present pose have nothing between them and a point light, bool (height, width).
+        """Pixels of a cast of the present pose that a point light reaches, bool (height, width).
 
-        Shadows of moving bodies on what rests are cast at half resolution, and again for each pixel near their rims.
-        Geoms are convex, so what faces the light is never in its own geom's shadow; touching bodies are 3 mm apart here.
+        Shadows of moving bodies on static ones are cast at half resolution, and at full resolution near their edges.
+        Geoms are convex, so a surface that faces the light is never in its own geom's shadow; hits less than 3 mm before
+        the surface cast none.
         """
         light = np.asarray(light_m, float)
         key = (*view_key(hits.view), light.tobytes())
@@ -200,7 +201,7 @@ class Raycaster:
     def _shoot(
         self, origin: np.ndarray, rays: np.ndarray, group: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Geom, distance and normal of the first hit of unit rays (n, 3) from a place."""
+        """Geom, distance and normal of the first hit of unit rays (n, 3) from a point."""
         count = len(rays)
         geom, distance, normal = np.full(count, -1, np.int32), np.zeros(count), np.zeros((count, 3))
         if count:
@@ -211,7 +212,7 @@ class Raycaster:
         return geom, distance, normal
 
     def _may_move(self, view: Viewpoint) -> np.ndarray:
-        """Pixels whose ray can meet a moving geom: within the rectangle around its bounding sphere."""
+        """Pixels whose ray may hit a moving geom: those within the rectangle around its bounding sphere."""
         k = view.intrinsics
         mask = np.zeros((k.height, k.width), bool)
         radius = self.model.geom_rbound[self.geom_moves]
@@ -230,10 +231,10 @@ class Raycaster:
         return mask
 
     def _shaded(self, hits: Hits, pixels: np.ndarray, light: np.ndarray, group: np.ndarray | None) -> np.ndarray:
-        """Whether geoms of a group stand between the light and pixels (flat indices)."""
+        """Whether geoms of a group lie between the light and pixels (flat indices)."""
         own = hits.geom.reshape(-1)[pixels]
         ray = hits.world_m.reshape(-1, 3)[pixels] - light
-        # What faces away from the light is dark without a ray: half of most pictures' movers.
+        # Surfaces that face away from the light are dark without a ray: half of the moving pixels in most pictures.
         faces = (own >= 0) & (np.einsum("ni,ni->n", ray, hits.normal.reshape(-1, 3)[pixels]) < 0)
         faces = np.flatnonzero(faces)
         ray = ray[faces]
@@ -248,21 +249,21 @@ class Raycaster:
         return shaded
 
     def _may_meet_movers(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """Which unit rays (n, 3) from a place pass the bounding sphere of a moving body: a look that is cheaper than a cast."""
+        """Which unit rays (n, 3) from a point meet the bounding sphere of a moving body; cheaper than casting them."""
         body, centre, radius = self._spheres
         turn = self.data.xmat.reshape(-1, 3, 3)[body]
         toward = self.data.xpos[body] + np.einsum("nij,nj->ni", turn, centre) - origin
         away = np.linalg.norm(toward, axis=1)
         if np.any(away <= radius):
             return np.ones(len(rays), bool)
-        # A little wide, for the rounding of single precision.
+        # With a margin for the rounding of single precision.
         least = np.sqrt(1 - (radius / away) ** 2) - 1e-5
         cosine = rays.astype(np.float32) @ (toward / away[:, None]).T.astype(np.float32)
         return np.any(cosine >= least.astype(np.float32), axis=1)
 
 
 def _bounding_spheres(model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Number, middle (in its frame) and radius of every body that moves."""
+    """Index, centre (in the body's frame) and radius of the bounding sphere of every moving body."""
     bodies = np.flatnonzero(model.body_mocapid >= 0)
     centre, radius = np.zeros((len(bodies), 3)), np.zeros(len(bodies))
     for row, body in enumerate(bodies):
@@ -286,7 +287,7 @@ def _doubled(mask: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _keep(cache: dict, key: tuple, value) -> None:
-    """Store, and forget the oldest: a moving camera must not fill the memory."""
+    """Store a value and drop the oldest ones: a moving camera must not fill the memory."""
     while len(cache) >= _MAX_VIEWS:
         cache.pop(next(iter(cache)))
     cache[key] = value

@@ -1,6 +1,7 @@
-"""What depth sensors make of exact depth: noise, quantisation, missing pixels; cameras, and the times of frames.
+"""Models of depth sensors: noise, quantisation, missing pixels. Cameras' intrinsics, and the times of frames.
 
-Laws of noise are those of the papers named, compared with public implementations; what has no source is called assumed.
+Noise models are those of the cited papers, compared with public implementations; values without a source are marked
+as assumed.
 """
 
 from __future__ import annotations
@@ -32,21 +33,22 @@ def _centred(focal_px: float, width: int, height: int) -> Intrinsics:
 
 @dataclasses.dataclass(frozen=True)
 class KinectV2:
-    """Time of flight (Kinect v2). Far, dark, shiny and grazing surfaces return little light: noise, then nothing.
+    """Time of flight (Kinect v2). Far, dark, shiny and grazing surfaces return little light: more noise, then no depth.
 
-    Returned light is taken as reflectance * cos(incidence) / z^2. Assumed: the threshold, at which a white wall is seen
-    to 8 m and black cloth is lost at about 2.5 m, and what happens at edges. That dark and shiny surfaces, grazing
-    angles and edges (flying pixels) cost depth is measured (Wasenmueller and Stricker, ACCV workshops 2016), not here.
+    Returned light is modelled as reflectance * cos(incidence) / z^2. Assumed: the threshold, at which a white wall has
+    depth up to 8 m and black cloth up to about 2.5 m, and the behaviour at edges. That dark and shiny surfaces, grazing
+    angles and edges (flying pixels) cause missing depth is known from measurements (Wasenmueller and Stricker, ACCV
+    workshops 2016).
     """
 
     near_m: float = 0.5
-    far_m: float = 8.0  # 4.5 m is what the maker vouches for
-    reference_reflectance: float = 0.5  # at which the law of the paper is taken to hold
+    far_m: float = 8.0  # the manufacturer specifies 4.5 m
+    reference_reflectance: float = 0.5  # for which the noise model of the paper is taken to hold
     min_return: float = 0.008  # 1/m^2
-    min_facing: float = 0.1  # cosine: lost from 84 degrees (assumed)
-    shine_loss: float = 0.8  # of the returned light, for a mirror
-    flying_fraction: float = 0.5  # of pixels beside an edge, that mix both sides (assumed)
-    edge_loss_fraction: float = 0.25  # of those, dropped by the sensor's own filter (assumed)
+    min_facing: float = 0.1  # cosine: no depth from 84 degrees on (assumed)
+    shine_loss: float = 0.8  # fraction of the returned light that a mirror loses
+    flying_fraction: float = 0.5  # of pixels beside an edge that mix the depth of both sides (assumed)
+    edge_loss_fraction: float = 0.25  # of those, removed by the sensor's own filter (assumed)
     dropout: float = 0.001
 
     def noise_m(self, depth_m: np.ndarray, facing: np.ndarray, reflectance: np.ndarray) -> np.ndarray:
@@ -65,7 +67,7 @@ class KinectV2:
         near, far, edge = _edges(z, facing, hits.view.intrinsics.fx_px)
         normal, chance, mix = _draws(rng, z.shape)
         returned = reflectance * facing * (1 - self.shine_loss * shine) / np.maximum(z * z, 0.01)
-        # A mirror seen straight on blinds the sensor with its own light.
+        # A mirror that faces the sensor blinds it with its own light.
         blinded = (shine > 0.6) & (facing > 0.985)
         missing = (
             (hits.geom < 0) | blinded | (facing < self.min_facing) | (returned * (1 + 0.15 * normal) < self.min_return)
@@ -81,7 +83,7 @@ class KinectV2:
 
 @dataclasses.dataclass(frozen=True)
 class Xtion:
-    """Structured light (Xtion, Kinect v1). What the projector, beside the camera, does not reach is missing.
+    """Structured light (Xtion, Kinect v1). Surfaces that the projector, beside the camera, does not reach have no depth.
 
     Depth is quantised in eighths of a pixel of disparity at 580 px and 75 mm (Khoshelham and Elberink, Sensors 2012:
     2.85 mm at 1 m, growing with z^2).
@@ -92,13 +94,13 @@ class Xtion:
     baseline_m: float = 0.075
     focal_px: float = 580.0  # of the infra-red camera at 640 px
     fraction: int = 8  # of a pixel of disparity
-    min_facing: float = 0.17  # cosine: lost from 80 degrees (assumed)
-    min_return: float = 0.006  # reflectance * facing / z^2 below which no dots are found (assumed)
+    min_facing: float = 0.17  # cosine: no depth from 80 degrees on (assumed)
+    min_return: float = 0.006  # reflectance * facing / z^2 below which no dots are detected (assumed)
     edge_px: float = 0.8  # lateral noise at 640 px (Nguyen et al., 2012)
     dropout: float = 0.002
 
     def noise_m(self, depth_m: np.ndarray, facing: np.ndarray) -> np.ndarray:
-        """Standard deviation of what is reported: 1.2 mm + 1.9 mm/m^2 (z - 0.4 m)^2 + 0.1 mm/sqrt(z) t^2 / (pi/2 - t)^2
+        """Standard deviation of the reported depth: 1.2 mm + 1.9 mm/m^2 (z - 0.4 m)^2 + 0.1 mm/sqrt(z) t^2 / (pi/2 - t)^2
         at incidence t (Nguyen, Izadi and Lovell, 3DIMPVT 2012; measured to about 3 m, continued beyond).
         """
         z = np.maximum(depth_m.astype(np.float32), 0.1)
@@ -119,7 +121,7 @@ class Xtion:
         other_column = np.clip(column + np.rint(step[1]).astype(int), 0, k.width - 1)
         z[row, column] = exact[other_row, other_column]
         steps = self.fraction * self.focal_px * self.baseline_m
-        # The law of the paper is of reported depth, so it holds what the quantisation adds: q / sqrt(12).
+        # The noise model is of reported depth and includes the quantisation noise, q / sqrt(12).
         quantum = z * z / steps
         sigma = np.sqrt(np.maximum(self.noise_m(z, facing) ** 2 - quantum * quantum / 12, 1e-8))
         noisy = np.maximum(z + normal * sigma, 0.1)
@@ -132,10 +134,10 @@ class Xtion:
         return np.where(missing, 0, np.rint(measured * 1000)).astype(np.uint16)
 
     def unlit(self, depth_m: np.ndarray, focal_px: float) -> np.ndarray:
-        """Pixels in the projector's shadow (height, width): to the left of what is near, as the projector is right.
+        """Pixels in the projector's shadow (height, width): to the left of near surfaces, as the projector is right.
 
-        A surface that the projector sees keeps its order along the row; one that a nearer one to its right has
-        overtaken does not.
+        Surfaces that the projector reaches keep their order along the row; those in the shadow of a nearer surface to
+        their right do not.
         """
         column = np.arange(depth_m.shape[1], dtype=np.float32)
         seen = np.where(depth_m > 0, column - focal_px * self.baseline_m / np.maximum(depth_m, 0.1), np.inf)
@@ -152,17 +154,17 @@ SENSORS: dict[str, KinectV2 | Xtion] = {"kinect_v2": KinectV2(), "xtion": Xtion(
 def frame_times(
     num_frames: int, rate_hz: float, rng: np.random.Generator, *, jitter_s: float = 0.004, drop_probability: float = 0.0
 ) -> np.ndarray:
-    """Times (num_frames,) in seconds from 0, strictly rising: nominal, jittered, a fraction of frames dropped between.
+    """Times (num_frames,) in seconds from 0, strictly increasing: a constant rate with jitter and dropped frames.
 
-    Jitter is normal and kept below 0.4 frames, so that frames never change places.
+    Jitter is normal and limited to 0.4 frames, so that frames keep their order.
     """
     if num_frames < 1 or rate_hz <= 0:
-        raise ValueError(f"{num_frames} frames at {rate_hz} Hz; at least 1 frame and a positive rate are needed.")
+        raise ValueError(f"{num_frames} frames at {rate_hz} Hz; expected at least 1 frame and a positive rate.")
     if not 0 <= drop_probability < 1 or jitter_s < 0:
         raise ValueError(
             f"drop_probability {drop_probability}, jitter_s {jitter_s}; expected 0 <= drop_probability < 1, jitter_s >= 0."
         )
-    # Kept frames are a geometric number of nominal ones apart.
+    # The number of nominal frames between two kept ones is geometrically distributed.
     apart = rng.geometric(1 - drop_probability, num_frames - 1) if drop_probability else np.ones(num_frames - 1, int)
     nominal = np.concatenate([[0], np.cumsum(apart)]) / rate_hz
     limit = 0.4 / rate_hz
@@ -170,14 +172,14 @@ def frame_times(
     return times - times[0]
 
 
-def _slant(facing: np.ndarray, most_degrees: float) -> np.ndarray:
-    """t / (pi/2 - t) of the angle of incidence t, which the laws of noise grow with; held above `most_degrees`."""
-    angle = np.arccos(np.clip(facing, np.cos(np.radians(most_degrees)), 1.0)).astype(np.float32)
+def _slant(facing: np.ndarray, max_degrees: float) -> np.ndarray:
+    """t / (pi/2 - t) of the angle of incidence t, on which the noise models depend; constant above `max_degrees`."""
+    angle = np.arccos(np.clip(facing, np.cos(np.radians(max_degrees)), 1.0)).astype(np.float32)
     return angle / (np.float32(np.pi / 2) - angle)
 
 
 def _edges(z: np.ndarray, facing: np.ndarray, focal_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nearest and farthest depth around each pixel (3x3), and whether that is more than a slope explains."""
+    """Nearest and farthest depth around each pixel (3x3), and whether they differ by more than a slope explains."""
     window = np.ones((3, 3), np.uint8)
     far = cv2.dilate(z, window)
     near = cv2.erode(np.where(z > 0, z, np.float32(1e3)), window)

@@ -1,7 +1,7 @@
-"""Colour pictures of a cast: point lights with shadows on textured surfaces, three levels of light, a camera's noise.
+"""Linear light of a cast: textured surfaces, point lights with shadows, ambient light, motion blur.
 
-NumPy throughout: what never moves is textured and lit once a viewpoint, so a frame costs what moves. Of the two ways to
-motion blur, it is the exact one: the mean of several casts while the shutter is open.
+Static surfaces are textured and lit once per viewpoint, so a frame costs only its moving pixels. Motion blur is exact:
+the mean of several casts while the shutter is open.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from .raycast import Raycaster
 from .textures import Paint
 from .viewpoint import Viewpoint, view_key
 
-_REFERENCE_M = 2.0  # where a light of power 1 lights fully
-_LAMP_M = 0.3  # radius of a lamp: nothing nearer gets brighter without end
+_REFERENCE_M = 2.0  # distance at which a light of power 1 lights a white wall fully
+_LAMP_M = 0.3  # radius of a lamp: bounds the light at small distances
 _MAX_VIEWS = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """What each pixel's surface is like, apart from light."""
+    """Material properties of each pixel's surface."""
 
     albedo: np.ndarray  # (height, width, 3) float32, linear
     shine: np.ndarray  # (height, width) float32
 
     @property
     def reflectance(self) -> np.ndarray:
-        """Reflectance in the infra-red (height, width), which depth sensors go by: grey to the power 0.6.
+        """Reflectance in the infra-red (height, width), on which depth sensors depend: grey to the power 0.6.
 
-        Most dyes are clearer there than to the eye, so dark cloth returns more than it looks (a guess at a rule).
+        Assumed: most dyes are brighter in the infra-red, so dark cloth returns more light than it appears to.
         """
         grey = self.albedo @ np.array([0.3, 0.5, 0.2], np.float32)
         return grey ** np.float32(0.6)
@@ -41,7 +41,7 @@ class Surface:
 
 @dataclasses.dataclass(frozen=True)
 class _StaticPart:
-    """A viewpoint's surfaces and light where nothing moves: kept, and patched where something does."""
+    """Surfaces and light of the static bodies from one viewpoint, kept between frames."""
 
     surface: Surface
     ambient: np.ndarray  # (height, width)
@@ -66,7 +66,7 @@ class Shader:
         return Surface(albedo, shine)
 
     def radiance(self, hits: Hits, surface: Surface | None = None, *, shadows: bool = True) -> np.ndarray:
-        """Linear light (height, width, 3) float32 of a cast of the stage's present pose: 1 = white, fully lit.
+        """Linear light (height, width, 3) float32 of a cast of the world's present pose: 1 = white, fully lit.
 
         Lambert's law and a Blinn-Phong highlight for each point light, whose light falls with squared distance; ambient
         light, a little stronger from above.
@@ -99,7 +99,7 @@ class Shader:
     ) -> np.ndarray:
         """Linear light of a frame whose shutter is open for `shutter_steps`, centred on a step: the mean of casts.
 
-        Leaves the stage posed at `step`. Costs `num_casts` pictures.
+        Leaves the world posed at `step`. Costs as much as `num_casts` pictures.
         """
         total = np.zeros((view.intrinsics.height, view.intrinsics.width, 3), np.float32)
         for part in (np.arange(num_casts) + 0.5) / num_casts - 0.5:
@@ -133,7 +133,7 @@ class Shader:
         normal = hits.normal.reshape(-1, 3)[pixels]
         ray = hits.world_m.reshape(-1, 3)[pixels] - hits.view.position_m
         facing = np.abs(np.einsum("ni,ni->n", ray, normal)) / np.linalg.norm(ray, axis=1)
-        # A pixel's size on the surface; on a slant, between those of its two directions.
+        # A pixel's size on the surface; on a slanted surface, between the sizes in its two directions.
         footprint = hits.depth_m.reshape(-1)[pixels] / hits.view.intrinsics.fx_px / np.sqrt(np.maximum(facing, 0.05))
         turned = np.einsum("nji,nj->ni", hits.geom_rotation[geom], normal)
         albedo[hit] = self._paint.albedo(geom, hits.local_m.reshape(-1, 3)[pixels], turned, footprint)
@@ -145,7 +145,7 @@ class Shader:
         return (self.raycaster.world.ambient * (0.85 + 0.15 * up)).astype(np.float32)
 
     def _light(self, hits: Hits, pixels: np.ndarray, light: Light) -> tuple[np.ndarray, np.ndarray]:
-        """Diffuse light on, and glare from, pixels (flat indices), without shadows."""
+        """Diffuse light and specular highlight of pixels (flat indices), without shadows."""
         normal = hits.normal.reshape(-1, 3)[pixels].astype(np.float32)
         point = hits.world_m.reshape(-1, 3)[pixels]
         to_light = (np.asarray(light.position_m) - point).astype(np.float32)

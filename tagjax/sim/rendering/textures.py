@@ -1,6 +1,6 @@
-"""What surfaces look like: patterns and photographs fixed in the frame of each geom, so that they move with it.
+"""Textures of surfaces: patterns and photographs fixed in the frame of each geom, so that they move with it.
 
-Every pattern is faded or averaged where its cells come near a pixel's size, so that nothing flickers at a distance.
+Every pattern is faded or averaged where its cells approach the size of a pixel, so that nothing flickers at a distance.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ PHOTOGRAPHS = {
     "grass": ("skimage", "data/grass.png"),
     "gravel": ("skimage", "data/gravel.png"),
 }
-"""Photographs by name: the package that brings each, and where it lies there. Nothing is downloaded."""
+"""Photographs by name: the package that contains each, and the path within it. Nothing is downloaded."""
 
 _PICTURE_GAMMA = 2.2
 _OCTAVES = ((1.0, 0.5), (2.7, 0.3), (7.1, 0.2))  # of the noise: frequency, weight
-_CAP = 0.75  # cosine to a round shape's axis above which it is covered from the end, not around
+_CAP = 0.75  # cosine to a round shape's axis above which the texture is projected along the axis
 
 
 class Paint:
-    """The surfaces of a stage's geoms: `albedo` of points on them."""
+    """The textures of all geoms: `albedo` of points on them."""
 
     def __init__(self, shapes: Sequence[Shape]):
         materials = [shape.material for shape in shapes]
@@ -45,13 +45,13 @@ class Paint:
         self._contrast = np.array([m.contrast for m in materials], np.float32)
         self._seed = np.array([m.seed & 0x7FFFFFFF for m in materials], np.uint32)
         self._round_m = np.array([0.0 if s.kind == "box" else _girth(s) for s in shapes], np.float32)
-        # A photograph that is not installed becomes noise, which is said once.
+        # A photograph that is not installed is replaced by noise, with one warning.
         pictures = [m.photo if m.texture == "photo" else "" for m in materials]
         missing = {name for name in pictures if name and photograph(name) is None}
         if missing:
             warnings.warn(
                 f"Photographs {sorted(missing)} are not installed (pip install {' '.join(_packages(missing))}); "
-                "their surfaces have noise instead.",
+                "their surfaces get noise instead.",
                 stacklevel=2,
             )
         self._kind = np.array(
@@ -91,7 +91,7 @@ class Paint:
 def photograph(name: str) -> tuple[np.ndarray, ...] | None:
     """A photograph of an installed package as a pyramid of linear pictures, float32; None where it is not installed."""
     if name not in PHOTOGRAPHS:
-        raise ValueError(f"No photograph is called {name!r}; there are {', '.join(PHOTOGRAPHS)}.")
+        raise ValueError(f"photo is {name!r}; expected one of {', '.join(PHOTOGRAPHS)}.")
     package, path = PHOTOGRAPHS[name]
     found = importlib.util.find_spec(package)
     if found is None or found.origin is None:
@@ -119,9 +119,9 @@ def _girth(shape: Shape) -> float:
 
 
 def _unrolled(point: np.ndarray, normal: np.ndarray, round_m: np.ndarray) -> np.ndarray:
-    """Points as places in metres on the flat surface, (points, 2): right and down.
+    """Points as texture coordinates in metres, (points, 2): right and down.
 
-    Boxes by the face's own axes; round shapes around their z axis, and their ends from above.
+    Boxes use the axes of each face; round shapes are unrolled around their z axis, and their ends projected along it.
     """
     x, y, z = point.T
     facing = np.abs(normal)
@@ -129,7 +129,7 @@ def _unrolled(point: np.ndarray, normal: np.ndarray, round_m: np.ndarray) -> np.
     end = np.where(is_round, facing[:, 2] > _CAP, (facing[:, 2] >= facing[:, 0]) & (facing[:, 2] >= facing[:, 1]))
     side = facing[:, 0] >= facing[:, 1]
     around = np.arctan2(y, x) * np.where(is_round, round_m, 1)
-    # Seen from outside, right is right on every face: letters are not mirrored.
+    # Seen from outside, right is right on every face, so that letters are not mirrored.
     flat = np.where(side, y * np.sign(normal[:, 0]), -x * np.sign(normal[:, 1]))
     right = np.where(end, -y, np.where(is_round, around, flat))
     return np.stack([right, np.where(end, -x, -z)], axis=-1)
@@ -142,7 +142,7 @@ def _square(cells: np.ndarray, width: np.ndarray) -> np.ndarray:
 
 
 def _kept(width: np.ndarray, limit: float) -> np.ndarray:
-    """How much is left of a pattern whose cells are 1 wide, seen by pixels `width` wide: 1, to 0 at `limit` cells."""
+    """Remaining contrast of a pattern of cells 1 wide at pixels `width` wide: from 1 down to 0 at `limit` cells."""
     part = np.clip((limit - width) / (0.5 * limit), 0, 1)
     return part * part * (3 - 2 * part)
 
@@ -157,7 +157,7 @@ def _cloud(cells: np.ndarray, width: np.ndarray, seed: np.ndarray) -> np.ndarray
             cells[some] * np.float32(frequency) + np.float32(7.3 * octave), seed[some] + np.uint32(octave)
         )
         out[some] += np.float32(weight) * kept[some] * (value - 0.5)
-    # Sums of uniform values crowd in the middle.
+    # Sums of uniform values concentrate in the middle of their range.
     return np.clip(out * 3, -1, 1)
 
 
@@ -169,7 +169,7 @@ def _speckle(cells: np.ndarray, width: np.ndarray, seed: np.ndarray) -> np.ndarr
 
 
 def _value_noise(cells: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """Random values at whole cells, smoothly between; 0 to 1, (points,) of (points, 3)."""
+    """Value noise: random values at integer positions, interpolated smoothly; 0 to 1, (points,) of (points, 3)."""
     floor = np.floor(cells)
     part = cells - floor
     part = part * part * (3 - 2 * part)
@@ -189,7 +189,7 @@ def _value_noise(cells: np.ndarray, seed: np.ndarray) -> np.ndarray:
 
 
 def _scrambled(key: np.ndarray) -> np.ndarray:
-    """A value of 0 to 1 of each key, float32 (the finaliser of MurmurHash3, without its last multiplication)."""
+    """A hash value from 0 to 1 of each key, float32 (the finaliser of MurmurHash3 without its last multiplication)."""
     key = (key ^ (key >> np.uint32(16))) * np.uint32(0x85EBCA6B)
     key = (key ^ (key >> np.uint32(13))) * np.uint32(0xC2B2AE35)
     return (key >> np.uint32(8)).astype(np.float32) * np.float32(1 / 2**24)
@@ -198,9 +198,9 @@ def _scrambled(key: np.ndarray) -> np.ndarray:
 def _sampled(
     name: str, place_m: np.ndarray, per_metre: np.ndarray, footprint_m: np.ndarray, seed: np.ndarray
 ) -> np.ndarray:
-    """Colours (points, 3) of a photograph laid over places (points, 2), mirrored at its borders; from its pyramid.
+    """Colours (points, 3) of a photograph at texture coordinates (points, 2), mirrored at its borders, from its pyramid.
 
-    `per_metre` pictures a metre of width. A seed other than 0 chooses another part of the picture.
+    `per_metre` is the number of pictures per metre of width. A seed other than 0 selects another part of the picture.
     """
     levels = photograph(name)
     assert levels is not None

@@ -29,11 +29,11 @@ def look_at(
     target_m: Sequence[float] | np.ndarray,
     up: Sequence[float] | np.ndarray = (0.0, 0.0, 1.0),
 ) -> Viewpoint:
-    """A camera at a place that looks at another, upright; straight down or up, the picture's top is towards +x."""
+    """An upright camera at a position that looks at a target. Looking straight down or up, the picture's top is +x."""
     position = np.asarray(position_m, float)
     forward = np.asarray(target_m, float) - position
     if np.linalg.norm(forward) < 1e-9:
-        raise ValueError(f"A camera at {position} cannot look at itself; move its target.")
+        raise ValueError(f"Camera position and target are both {position}; expected two different points.")
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, np.asarray(up, float))
     if np.linalg.norm(right) < 1e-6:
@@ -43,5 +43,5 @@ def look_at(
 
 
 def view_key(view: Viewpoint) -> tuple[Intrinsics, bytes, bytes]:
-    """What tells two viewpoints apart, as a key of a dictionary."""
+    """A dictionary key that identifies a viewpoint."""
     return view.intrinsics, view.position_m.tobytes(), view.rotation.tobytes()

@@ -1,4 +1,4 @@
-"""Whether a camera sees a body of a world, from the poses alone: no picture is rendered."""
+"""Visibility of bodies from a camera, computed from the poses alone, without rendering."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CUBE = _CUBE[np.isin(np.abs(_CUBE).sum(axis=1), (1, 3))]  # faces and corners
 
 
 def surface_points(shapes: Sequence[Shape]) -> Float[np.ndarray, "points 3"]:
-    """14 points on the surface of every shape, in the frame of their body: faces and corners, or all round."""
+    """14 points on the surface of every shape, in the frame of its body: faces and corners, or evenly around."""
     parts = []
     for shape in shapes:
         a, b, c = shape.size_m
@@ -41,10 +41,10 @@ def visible_fraction(
     camera: Viewpoint | Sequence[float],
     steps: Int[np.ndarray, " steps"],
 ) -> Float[np.ndarray, " steps"]:
-    """Share of the surface points of some bodies that nothing else hides from a camera, at steps of the world.
+    """Fraction of the surface points of some bodies that no other body hides from a camera, at steps of the world.
 
-    A `Viewpoint` counts only what lies in its picture; a place (x, y, z) looks everywhere. The bodies do not hide
-    themselves: if the camera has a free line to a point of a far side, it sees the near side that the line enters by.
+    With a `Viewpoint` only points within its picture count; a position (x, y, z) looks in all directions. The bodies do
+    not hide themselves: a free line to a point on the far side enters by a visible point on the near side.
     """
     place = camera.position_m if isinstance(camera, Viewpoint) else np.asarray(camera, float)
     points = np.concatenate([_placed(world, body, steps) for body in bodies], axis=1)
@@ -62,13 +62,13 @@ def visible_fraction(
 
 
 def intervals(seen: Bool[np.ndarray, " steps"]) -> Int[np.ndarray, "intervals 2"]:
-    """First and one past the last index of every maximal run of True."""
+    """First and one past the last index of every maximal run of True values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
     return edges.reshape(-1, 2)
 
 
 def sampled_steps(world: World, period_s: float) -> Int[np.ndarray, " steps"]:
-    """Steps of a world, `period_s` apart, and its last one."""
+    """Steps of a world, `period_s` apart, and its last step."""
     return np.unique(np.append(np.arange(0, world.num_steps, max(1, round(period_s / STEP_S))), world.num_steps - 1))
 
 

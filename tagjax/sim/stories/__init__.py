@@ -1,7 +1,7 @@
-"""What happens in a simulated recording: who carries, waves, hides and hands over what, in which room.
+"""Stories: the actions in a simulated recording, such as walking, waving, hiding and handing over of tagged objects.
 
-Every story is a function of a random generator, a duration and its own settings, and gives a `Scenario` world. `STORIES`
-names them; `build_scenario` checks settings against their signatures.
+Every story is a function of a random generator, a duration and its own settings that returns a `Scenario`. `STORIES`
+lists them by name; `build_scenario` checks settings against their signatures.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ STORIES: Mapping[str, Callable[..., Scenario]] = {
     "shop_handover": shop_handover,
     "grid": grid,
 }
-"""What can be told, by name."""
+"""The stories by name."""
 
 
 def build_scenario(
     name: str, rng: np.random.Generator, duration_s: float, settings: Mapping[str, Any] | None = None
 ) -> Scenario:
-    """The story of a name with its settings; an unknown name or setting raises `ValueError`."""
+    """The scenario of a story with its settings. An unknown name or setting raises `ValueError`."""
     if name not in STORIES:
-        raise ValueError(f"Unknown story {name!r}; known are {', '.join(STORIES)}.")
+        raise ValueError(f"story is {name!r}; expected one of {', '.join(STORIES)}.")
     if not duration_s > 0:
-        raise ValueError(f"A story of {duration_s} s; a positive duration is needed.")
+        raise ValueError(f"duration_s is {duration_s}; expected a positive duration.")
     known = list(inspect.signature(STORIES[name]).parameters)[2:]
     unknown = sorted(set(settings or {}) - set(known))
     if unknown:
-        raise ValueError(f"{name}: unknown setting {', '.join(unknown)}; known are {', '.join(known)}.")
+        raise ValueError(f"{name}: unknown setting {', '.join(unknown)}; expected settings among {', '.join(known)}.")
     return STORIES[name](rng, duration_s, **(settings or {}))

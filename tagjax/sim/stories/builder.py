@@ -1,4 +1,4 @@
-"""What stories fraction: a world in the making, places to stand, hands that wave, people and things around."""
+"""Building blocks of stories: the scenario builder, standing places, waving hands, walkers, static tags."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .scenario import Scenario
 
 UP = (0.0, 0.0, 1.0)
 
-HAND_M = (0.36, 0.27, 1.12)  # where a hand is held before the body: ahead, to the side, above the floor
+HAND_M = (0.36, 0.27, 1.12)  # position of a hand in front of the body: ahead, to the side, above the floor
 
 
 Badge = Literal["level", "upright"]
@@ -33,7 +33,7 @@ _BADGE_DIPOLES: dict[Badge, tuple[float, float, float]] = {"level": (0.0, 1.0, 0
 
 
 class ScenarioBuilder:
-    """Bodies, tags and labels of a world in the making."""
+    """Collects bodies, tags and labels, and returns the finished scenario."""
 
     def __init__(self, room: Room, duration_s: float):
         self.room, self.steps = room, num_steps(duration_s)
@@ -65,8 +65,8 @@ class ScenarioBuilder:
         if tagged:
             self.tags.append(Tag(default_epc(len(self.tags) + 1), len(self.bodies) - 1, model.tag_m, model.dipole))
 
-    def inside(self, path_m: np.ndarray) -> np.ndarray:
-        """A hand's path kept off the walls: who walks along a wall does not reach through it."""
+    def inside_room(self, path_m: np.ndarray) -> np.ndarray:
+        """A hand's path limited to 0.3 m from the walls: a person at a wall does not reach through it."""
         length, width, _ = self.room.size_m
         low, high = np.array([0.0, 0.3 - width / 2, 0.0]), np.array([length - 0.3, width / 2 - 0.3, np.inf])
         return np.clip(path_m, low, high)
@@ -77,7 +77,7 @@ class ScenarioBuilder:
         room = self.room
         if not 1 <= num_antennas <= len(room.antennas_m):
             raise ValueError(
-                f"{num_antennas} antennas asked for; the {room.name} has places for {len(room.antennas_m)}."
+                f"num_antennas is {num_antennas}; expected 1 to {len(room.antennas_m)}, the positions in the {room.name}."
             )
         world = World(
             bodies=tuple(self.bodies),
@@ -102,17 +102,17 @@ class ScenarioBuilder:
 
 
 def standing_walk(place: tuple[float, float], heading_rad: float, steps: int) -> Walk:
-    """A walk that never leaves its place (x, y)."""
+    """A walk that stays at one position (x, y)."""
     return walk_along(np.broadcast_to(np.array(place), (steps, 2)), heading_rad)
 
 
 def facing_towards(place: Sequence[float], other: Sequence[float]) -> float:
-    """Heading from a place on the floor towards another, radians."""
+    """Heading from one position on the floor towards another, radians."""
     return float(np.arctan2(other[1] - place[1], other[0] - place[0]))
 
 
 def placed_object(model: ObjectModel, place: Sequence[float], yaw_rad: float = 0.0) -> Poses:
-    """An object that stands at a place: x, y, and the height of what is below it."""
+    """Poses of a static object that stands at x, y and the height of the surface below it."""
     x, y, z = place
     return Poses.fixed((x, y, z + model.half_size_m[2]), turn_about(UP, yaw_rad))
 
@@ -120,12 +120,12 @@ def placed_object(model: ObjectModel, place: Sequence[float], yaw_rad: float = 0
 def waving_hand(
     walk: Walk, side: int, rng: np.random.Generator, duration_s: float, speed_m_s: float, stationary_s: float
 ) -> np.ndarray:
-    """World path of a hand that is still before the body, then waves at random with the given peak speed."""
+    """World path of a hand that is stationary in front of the body, then waves randomly with the given peak speed."""
     offset = (HAND_M[0], side * HAND_M[1], HAND_M[2] + float(rng.uniform(-0.05, 0.1)))
     start = hand_target(walk, offset)
     stationary_s = min(stationary_s, 0.4 * duration_s)
     moving = duration_s - stationary_s
-    # An arm that stays in front of the body reaches about 0.3 m around; faster waves need harder pushes.
+    # An arm in front of the body reaches about 0.3 m around; faster waves need more acceleration.
     push = max(12.0, 5.5 * speed_m_s**2)
     path = wave("random", (0.0, 0.0, 0.0), moving, peak_speed_m_s=speed_m_s, max_acceleration_m_s2=push, rng=rng)
     offsets = wait_then_move(path, stationary_s, duration_s)
@@ -133,19 +133,19 @@ def waving_hand(
 
 
 def ease(fraction: np.ndarray) -> np.ndarray:
-    """0 to 1 with the first derivative zero at both ends; gentler in the middle than `smooth_step`."""
+    """0 to 1 with the first derivative zero at both ends; less steep in the middle than `smooth_step`."""
     return fraction * fraction * (3 - 2 * fraction)
 
 
 def with_length(path: np.ndarray, steps: int) -> np.ndarray:
-    """The path cut, or its end held, to a number of steps."""
+    """The path with a given number of steps: shortened, or extended by its last position."""
     return path[np.minimum(np.arange(steps), len(path) - 1)]
 
 
 def standing_places(
     room: Room, rng: np.random.Generator, count: int, distance_m: tuple[float, float]
 ) -> list[tuple[float, float]]:
-    """Places (x, y) beside each other before the camera, clear of furniture."""
+    """Positions (x, y) beside each other in front of the camera, clear of furniture."""
     camera = np.array(room.camera_position_m[:2])
     for _ in range(2000):
         away = rng.uniform(*distance_m)
@@ -154,11 +154,13 @@ def standing_places(
         places = [(camera[0] + away, camera[1] + middle + gap * (k - (count - 1) / 2)) for k in range(count)]
         if all(is_clear(room, place) for place in places):
             return places
-    raise ValueError(f"No place for {count} people {distance_m} m before the camera of the {room.name}.")
+    raise ValueError(
+        f"No free positions for {count} people {distance_m} m in front of the camera of the {room.name}; try another seed."
+    )
 
 
 def is_clear(room: Room, place: tuple[float, float]) -> bool:
-    """Whether somebody can stand there: as walkers, or up to 0.2 m nearer to the camera."""
+    """Whether a person can stand there: in the walk area, or up to 0.2 m nearer to the camera."""
     x0, y0, x1, y1 = room.walk_area_m
     return is_free(np.asarray(place), (x0 - 0.2, y0, x1, y1), room.obstacles_m, 0.35)
 
@@ -170,7 +172,7 @@ def add_walkers(
     duration_s: float,
     taken: Sequence[tuple[float, float]],
 ) -> None:
-    """People with empty hands who walk behind those who stand."""
+    """Add people with empty hands who walk behind the standing ones."""
     if not count:
         return
     room = builder.room
@@ -184,7 +186,7 @@ def add_walkers(
 
 
 def walk_of_length(walk: Walk, steps: int) -> Walk:
-    """The walk cut, or its end held, to a number of steps."""
+    """The walk with a given number of steps: shortened, or extended by its last position."""
     index = np.minimum(np.arange(steps), len(walk.heading_rad) - 1)
     return Walk(*(getattr(walk, field.name)[index] for field in dataclasses.fields(walk)))
 
@@ -192,26 +194,26 @@ def walk_of_length(walk: Walk, steps: int) -> Walk:
 def add_static_tags(
     builder: ScenarioBuilder, rng: np.random.Generator, count: int, *, within_m: float = np.inf
 ) -> None:
-    """Small tagged things that lie on tables, shelves and the floor; they are not labelled.
+    """Add small tagged objects that lie on tables, shelves and the floor; they are not labelled.
 
-    Each at the first of a few places that is `within_m` from the first antenna, or at the last of them.
+    Of several random positions the first one `within_m` of the first antenna is taken, or else the last one.
     """
     antenna = np.array(builder.room.antennas_m[0])
     for _ in range(count):
         model = make_object(str(rng.choice(["book", "mug", "box"])), rng, scale=0.8)
-        place = _resting_place(builder.room, rng)
-        for _ in range(_PLACES):
+        place = _static_position(builder.room, rng)
+        for _ in range(_MAX_DRAWS):
             if np.linalg.norm(np.array(place) - antenna) <= within_m:
                 break
-            place = _resting_place(builder.room, rng)
+            place = _static_position(builder.room, rng)
         builder.object(model, placed_object(model, place, rng.uniform(0, 2 * np.pi)), labelled=False)
 
 
-_PLACES = 30
+_MAX_DRAWS = 30
 
 
-def _resting_place(room: Room, rng: np.random.Generator) -> tuple[float, float, float]:
-    """On a table or a shelf, mostly, or on the floor."""
+def _static_position(room: Room, rng: np.random.Generator) -> tuple[float, float, float]:
+    """A random position on a table or a shelf (probability 0.8), or on the floor."""
     tables = room.tables
     if tables and rng.random() < 0.8:
         table = tables[int(rng.integers(len(tables)))]

@@ -1,4 +1,4 @@
-"""A story of people who come into a room through a door, walk about in it, and leave by the same door."""
+"""A story of people who enter a room through a door, walk about in it, and leave through the same door."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from .builder import HAND_M, ScenarioBuilder, waving_hand, with_length
 from .scenario import Scenario
 
 INSIDE_S = 3.0
-"""Time that everybody is in sight, at least."""
+"""Minimum time for which every person is visible."""
 
 AWAY_S = 0.3
-"""Time at the start and at the end in which nobody is in sight, at least."""
+"""Minimum time at the start and at the end in which no person is visible."""
 
 _APART_M = 0.7
-_DOOR_M = 0.45  # before and behind the opening, where one walks straight
+_DOOR_M = 0.45  # distance before and behind the opening that is walked straight
 _TRIES = 400
-_EVERY_S = 0.15  # between looks
+_PERIOD_S = 0.15  # sampling period of the visibility check
 
 
 def enter_leave(
@@ -36,28 +36,30 @@ def enter_leave(
     num_people: int = 2,
     speed_m_s: Sequence[float] = (0.9, 1.3),
 ) -> Scenario:
-    """People come in through a door one after the other, walk about, and leave, an object in the right hand.
+    """People enter through a door one after the other, walk about, and leave, each with an object in the right hand.
 
-    Nobody is in sight in the first and the last `AWAY_S`; everybody is for `INSIDE_S` or more in between, in one
-    stretch or, behind somebody else, in several. Raises `ValueError` where that cannot be: too short, too many.
+    No person is visible in the first and the last `AWAY_S`; each is visible for at least `INSIDE_S` in between, in one
+    interval or, where others occlude, in several. Raises `ValueError` where the time is too short for so many people.
     """
     room = make_room("entrance", rng)
     assert room.door is not None
     if not 1 <= num_people <= len(room.door.outside_m):
-        raise ValueError(f"{num_people} people; behind the door there is place for 1 to {len(room.door.outside_m)}.")
+        raise ValueError(
+            f"num_people is {num_people}; expected 1 to {len(room.door.outside_m)}, the places behind the door."
+        )
     builder = ScenarioBuilder(room, duration_s)
     for walk in _visits(rng, room, duration_s, num_people, (speed_m_s[0], speed_m_s[1])):
         model = make_object(str(rng.choice(CARRIED_KINDS)), rng)
         hands = Hands(right=_hand(walk, room, rng, duration_s))
         motion = builder.person(make_person(rng), walk, hands)
         builder.object(model, carried_poses(motion.right_hand, model.grip_m))
-    scenario = builder.scenario(f"{num_people} people come in through a door and leave by it")
+    scenario = builder.scenario(f"{num_people} people enter through a door and leave through it")
     _check(scenario)
     return scenario
 
 
 def _visits(rng, room: Room, duration_s: float, num_people: int, speed: tuple[float, float]) -> list[Walk]:
-    """A walk for each person: out of sight, in, about, and back, never near another person or furniture."""
+    """A walk for each person: from behind the door into the room and back, never near another person or furniture."""
     found: list[np.ndarray] = []
     for number in range(num_people):
         for _ in range(_TRIES):
@@ -69,15 +71,15 @@ def _visits(rng, room: Room, duration_s: float, num_people: int, speed: tuple[fl
                 break
         else:
             raise ValueError(
-                f"No way in and out in {duration_s} s for person {number + 1} of {num_people}; give more time, or ask "
-                "for fewer people."
+                f"No walk in and out within {duration_s} s for person {number + 1} of {num_people}; give more time, or "
+                "ask for fewer people."
             )
-    # They wait with their faces to the door.
+    # They face the door while they wait.
     return [walk_along(path) for path in found]
 
 
 def _visit(rng, room: Room, number: int, duration_s: float, speed: tuple[float, float]) -> np.ndarray | None:
-    """Places (steps, 2) of one visit; None where it touches something or takes too long."""
+    """Positions (steps, 2) of one visit; None where it touches furniture or takes too long."""
     assert room.door is not None
     x, y = room.door.opening_m
     before, behind = np.array([x - _DOOR_M - 0.1, y]), np.array([x + _DOOR_M, y])
@@ -95,14 +97,14 @@ def _visit(rng, room: Room, number: int, duration_s: float, speed: tuple[float, 
         return None
     way += [before, behind, wait]
     pace = float(rng.uniform(*speed))
-    least_s = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) / pace
-    if not 0.4 * duration_s < least_s < duration_s - 2 * AWAY_S:
+    walking_s = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()) / pace
+    if not 0.4 * duration_s < walking_s < duration_s - 2 * AWAY_S:
         return None
     path = path_through([(*place, 0.0) for place in way], speed_m_s=pace, max_acceleration_m_s2=2.0)
     spare = duration_s - (len(path) - 1) * STEP_S - 2 * AWAY_S
     if spare < 0:
         return None
-    # Whoever waits nearer to the door goes first, more or less.
+    # The start is delayed at random within the spare time.
     delay = AWAY_S + rng.uniform(0.0, spare)
     path = with_length(wait_then_move(path, delay), num_steps(duration_s))[:, :2]
     clear = [_clearance(path, box) for box in obstacles]
@@ -115,7 +117,7 @@ def _clearance(path: np.ndarray, box: tuple[float, float, float, float]) -> floa
 
 
 def _hand(walk: Walk, room: Room, rng: np.random.Generator, duration_s: float) -> np.ndarray:
-    """The right hand's path: waved a little in the room, close to the body in the doorway and behind it."""
+    """The right hand's path: waves a little in the room, stays close to the body in the doorway and behind it."""
     assert room.door is not None
     waved = waving_hand(walk, -1, rng, duration_s, 0.5, 0.0)
     close = hand_target(walk, (HAND_M[0] - 0.06, -0.14, 1.05))
@@ -124,18 +126,18 @@ def _hand(walk: Walk, room: Room, rng: np.random.Generator, duration_s: float) -
 
 
 def _check(scenario: Scenario) -> None:
-    """Raise `ValueError` unless everybody is away at both ends and in sight between."""
+    """Raise `ValueError` unless every person is invisible at both ends and visible in between."""
     world = scenario.world
-    looks = sampled_steps(world, _EVERY_S)
-    away = 1 + int(AWAY_S / _EVERY_S)
+    sampled = sampled_steps(world, _PERIOD_S)
+    away = 1 + int(AWAY_S / _PERIOD_S)
     bodies: dict[str, list[int]] = {}
     for number, body in enumerate(world.bodies):
         if body.role == "person":
             bodies.setdefault(body.name, []).append(number)
     for (name, limbs), tag in zip(bodies.items(), world.tags, strict=True):
-        seen = visible_fraction(world, (*limbs, tag.body), scenario.camera_position_m, looks) > 0
+        seen = visible_fraction(world, (*limbs, tag.body), scenario.camera_position_m, sampled) > 0
         if seen[:away].any() or seen[-away:].any():
-            raise ValueError(f"{name} is in sight at the start or the end; try another seed.")
-        shown = float(np.diff(intervals(seen), axis=1).sum()) * _EVERY_S
+            raise ValueError(f"{name} is visible at the start or the end; try another seed.")
+        shown = float(np.diff(intervals(seen), axis=1).sum()) * _PERIOD_S
         if shown < INSIDE_S:
-            raise ValueError(f"{name} is in sight for {shown:.1f} s, less than {INSIDE_S} s; try another seed.")
+            raise ValueError(f"{name} is visible for {shown:.1f} s; expected at least {INSIDE_S} s. Try another seed.")

@@ -1,4 +1,4 @@
-"""Stories of people who stand: objects waved, hidden, handed over and put down."""
+"""Stories of hand-held objects and standing people: objects are waved, hidden, handed over and put down."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from .builder import (
 )
 from .scenario import Scenario
 
-_DRAWS = 8  # of waves within reach of the arms
-_NEAR_M = 5.0  # still tags farther away are hardly read
+_DRAWS = 8  # draws of waves until one is within reach of the arms
+_NEAR_M = 5.0  # static tags farther away are rarely read
 
 
 def handheld(
@@ -46,15 +46,16 @@ def handheld(
     num_antennas: int = 1,
     distance_m: Sequence[float] = (1.7, 2.3),
 ) -> Scenario:
-    """People before the camera wave an object in each hand, at rest for `stationary_s` first
-    (two fifths of the time at most).
+    """People in front of the camera wave an object in each hand, after `stationary_s` without motion.
 
-    `lookalikes` names kinds whose objects look exactly alike; `one_grip` puts all objects into one hand, side by side;
-    `passing` lets a notebook in the other hand pass before the (one) object; `num_walkers` walk behind;
-    `num_static_tags` lie around.
+    `stationary_s` is limited to two fifths of the duration. Objects of the kinds in `lookalikes` look identical;
+    `one_grip` puts all objects into one hand, side by side; with `notebook_occluder` a notebook in the other hand moves
+    in front of the (only) object; `num_walkers` people walk behind; `num_static_tags` tagged objects lie in the room.
     """
     if notebook_occluder and len(kinds) != 1:
-        raise ValueError(f"A notebook passes before one object; found {len(kinds)} kinds.")
+        raise ValueError(
+            f"notebook_occluder with {len(kinds)} kinds; expected one kind, as the other hand holds the notebook."
+        )
     builder = ScenarioBuilder(make_room(room, rng), duration_s)
     looks = {kind: int(rng.integers(2**31)) for kind in lookalikes}
     models = [make_object(kind, rng, look=looks.get(kind)) for kind in kinds]
@@ -69,23 +70,25 @@ def handheld(
         waves = [waving_hand(walk, side, rng, duration_s, speed_m_s, stationary_s) for side in sides]
         person = make_person(rng)
         for _ in range(_DRAWS):
-            # An arm that is too short stops its hand short of the wave, with a jerk.
+            # A hand at the limit of its arm's length stops abruptly: draw another wave.
             if _reaches(person, walk, waves):
                 break
             waves = [waving_hand(walk, side, rng, duration_s, speed_m_s, stationary_s) for side in sides]
         left = (
-            _before(walk, waves[0], camera, duration_s) if notebook_occluder else (waves[1] if len(waves) > 1 else None)
+            _occluding_hand(walk, waves[0], camera, duration_s)
+            if notebook_occluder
+            else (waves[1] if len(waves) > 1 else None)
         )
         hands = Hands(left=left, right=waves[0])
         motion = builder.person(person, walk, hands)
         if one_grip:
-            _together(builder, mine, motion.right_hand)
+            _add_bundle(builder, mine, motion.right_hand)
         else:
             for model, hand in zip(mine, (motion.right_hand, motion.left_hand), strict=False):
                 builder.object(model, carried_poses(hand, model.grip_m))
         if notebook_occluder:
             notebook = make_object("notebook", rng, scale=1.25)
-            builder.object(notebook, _upright_sheet(notebook, motion.left_hand, camera), tagged=False)
+            builder.object(notebook, _facing_camera(notebook, motion.left_hand, camera), tagged=False)
     add_walkers(builder, rng, num_walkers, duration_s, places)
     add_static_tags(builder, rng, num_static_tags, within_m=_NEAR_M)
     middle = np.mean(places, axis=0)
@@ -95,14 +98,14 @@ def handheld(
 
 
 def _reaches(person: PersonModel, walk: Walk, waves: Sequence[np.ndarray]) -> bool:
-    """Whether the right hand, and the left if it has a wave, keep to their waves, to 2 mm."""
+    """Whether the right hand, and the left one if it waves, follow their targets to 2 mm."""
     motion = move_person(person, walk, Hands(right=waves[0], left=waves[1] if len(waves) > 1 else None))
     hands = (motion.right_hand, motion.left_hand)
     return all(np.abs(wave - hand.position_m).max() < 0.002 for wave, hand in zip(waves, hands, strict=False))
 
 
-def _together(builder: ScenarioBuilder, models: Sequence[ObjectModel], hand: Poses) -> None:
-    """All objects as one rigid bundle in a hand."""
+def _add_bundle(builder: ScenarioBuilder, models: Sequence[ObjectModel], hand: Poses) -> None:
+    """Add all objects as one rigid bundle in a hand."""
     first = carried_poses(hand, models[0].grip_m)
     turn = rotation_matrix(first.quaternion)
     reach = 0.0
@@ -112,8 +115,8 @@ def _together(builder: ScenarioBuilder, models: Sequence[ObjectModel], hand: Pos
         builder.object(model, Poses(first.position_m + turn @ np.array([0.0, reach, 0.0]), first.quaternion))
 
 
-def _before(walk: Walk, object_m: np.ndarray, camera_m: Sequence[float], duration_s: float) -> np.ndarray:
-    """A hand that brings a notebook between camera and object for a second, about the middle, and takes it away."""
+def _occluding_hand(walk: Walk, object_m: np.ndarray, camera_m: Sequence[float], duration_s: float) -> np.ndarray:
+    """Path of a hand that holds a notebook between camera and object for a second, in the middle of the recording."""
     time_s = np.arange(len(object_m)) * STEP_S
     toward = np.asarray(camera_m) - object_m
     cover = object_m + 0.2 * toward / np.linalg.norm(toward, axis=1, keepdims=True)
@@ -124,15 +127,15 @@ def _before(walk: Walk, object_m: np.ndarray, camera_m: Sequence[float], duratio
     return (1 - fraction) * aside + fraction * cover
 
 
-def _upright_sheet(model: ObjectModel, hand: Poses, camera_m: Sequence[float]) -> Poses:
-    """A flat object that faces the camera, held at its middle."""
+def _facing_camera(model: ObjectModel, hand: Poses, camera_m: Sequence[float]) -> Poses:
+    """Poses of a flat object that faces the camera, held at its centre."""
     toward = np.asarray(camera_m) - hand.position_m
     toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
     side = np.cross([0.0, 0.0, 1.0], toward)
     side = side / np.linalg.norm(side, axis=1, keepdims=True)
     thin = int(np.argmin(model.half_size_m))
     axes: list[np.ndarray] = [np.cross(toward, side), side, toward]
-    columns = [axes[(k - thin - 1) % 3] for k in range(3)]  # the thin axis looks at the camera
+    columns = [axes[(k - thin - 1) % 3] for k in range(3)]  # the thin axis points to the camera
     return Poses(hand.position_m.copy(), quaternion_of(np.stack(columns, axis=-1)))
 
 
@@ -144,7 +147,7 @@ def handover(
     kind: str = "box",
     speed_m_s: float = 0.9,
 ) -> Scenario:
-    """One person waves an object and hands it to another, who waves it on."""
+    """One person waves an object and hands it to another person, who goes on waving it."""
     builder = ScenarioBuilder(make_room(room, rng), duration_s)
     (place,) = standing_places(builder.room, rng, 1, (2.0, 2.6))
     half = 0.45
@@ -152,7 +155,7 @@ def handover(
     across = np.array([-(place[1] - camera[1]), place[0] - camera[0]])
     across = across / np.linalg.norm(across)
     spots = [np.array(place) - half * across, np.array(place) + half * across]
-    # Half turned to each other, half to the camera.
+    # The headings are halfway between the other person and the camera.
     toward = (camera - place) / np.linalg.norm(camera - place)
     walks = []
     for spot, side in zip(spots, (1, -1), strict=True):
@@ -172,7 +175,7 @@ def handover(
     motions = [builder.person(person, walk, hand) for person, walk, hand in zip(people, walks, hands, strict=True)]
     model = make_object(kind, rng)
     giver, taker = carried_poses(motions[0].left_hand, model.grip_m), carried_poses(motions[1].right_hand, model.grip_m)
-    # Both hands are at the meeting point for a moment; the object goes over within it.
+    # Both hands are at the meeting point for a moment; the object changes hands within it.
     fraction = np.clip((time_s - meet_s) / 0.2 + 0.5, 0, 1)[:, None]
     fraction = ease(fraction)
     turn = (1 - fraction) * giver.quaternion + fraction * taker.quaternion * np.sign(
@@ -191,7 +194,7 @@ def put_down(
     kind: str = "bottle",
     speed_m_s: float = 1.0,
 ) -> Scenario:
-    """A person waves an object, puts it down on a stand, and takes the hand away: it stays there."""
+    """A person waves an object, puts it down on a stand, and takes the hand away; the object stays there."""
     builder = ScenarioBuilder(make_room(room, rng), duration_s)
     (place,) = standing_places(builder.room, rng, 1, (1.9, 2.5))
     camera = builder.room.camera_position_m
@@ -200,7 +203,7 @@ def put_down(
     down_s = 0.6 * duration_s
     waved = waving_hand(walk, -1, rng, duration_s, speed_m_s, 0.5)
     spot, aside = hand_target(walk, (0.42, -0.3, 0.95)), hand_target(walk, (0.12, -0.34, 0.85))
-    # Down to the spot, a moment of rest there, then back to the side.
+    # The hand moves down to the stand, pauses there, then moves to the side.
     lower = smooth_step(np.clip((time_s - down_s + 0.8) / 0.8, 0, 1))[:, None]
     leave = smooth_step(np.clip((time_s - down_s - 0.2) / 0.6, 0, 1))[:, None]
     hands = Hands(right=(1 - leave) * ((1 - lower) * waved + lower * spot) + leave * aside)

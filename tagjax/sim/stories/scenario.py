@@ -11,7 +11,7 @@ from ..world.furniture import Panel
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """A world, and how it is scenario and read: all that a recording is made of. Places in the world frame."""
+    """A world with its camera, antennas and reader: all that a recording depends on. Positions are in the world frame."""
 
     world: World
     camera_position_m: tuple[float, float, float]

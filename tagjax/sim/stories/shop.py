@@ -1,6 +1,6 @@
-"""Stories of a shop with ceiling antennas: people leave with tagged things or stay, hand one over; and its calibration.
+"""Stories of a shop with ceiling antennas: people with tagged objects leave or stay, or hand one over; and calibration.
 
-The shop of a `site` is always the same one, as a calibration wants it; people, things and walks differ.
+The shop of a `site` is always the same, as calibration requires; people, objects and walks differ.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ EXIT_X_M = 1.4
 """Where the exit begins: below the first antenna, room frame."""
 
 KINDS = ("bag", "box", "bottle", "toy")
-"""What people carry out of the shop."""
+"""Kinds of objects that people carry out of the shop."""
 
 _GREY = Material((0.4, 0.4, 0.42), "speckle", 20.0, 0.1, transmission_db=2.0)
 
 _BOX_HALF_M = 0.27
-_BOX_SIDE_M = 1.2  # of its middle, from the antennas' line: who walks along the line does not touch it
+_BOX_SIDE_M = 1.2  # distance of its centre from the line of the antennas, clear of people who walk along the line
 
-_LANE_M = 0.35  # each side of the middle at a hand-over: neither hides the other from the camera
-_REACH_M = 0.35  # ahead of the body, where hands meet
+_LANE_M = 0.35  # distance of each person from the centre line at a hand-over: neither occludes the other
+_REACH_M = 0.35  # distance ahead of the body at which hands meet
 
 
 def shop_exit(
@@ -50,15 +50,15 @@ def shop_exit(
     static_within_m: float | None = None,
     site: int | None = None,
 ) -> Scenario:
-    """People with tagged things walk about a shop of 3 x 7 m; each leaves through the exit, or stays (`stay_probability`).
+    """People with tagged objects walk about a shop of 3 x 7 m; each leaves through the exit, or stays.
 
-    Bystanders carry nothing and walk to and fro between the exit's line and the shop's far end. Still tags lie anywhere,
-    or, with `static_within_m`, on a grey box at most so far inwards of the exit's antenna, which hears them all the time.
-    `tags`: "object", as each thing has its tag, or "level", labels that lie level any way round, as ceiling antennas want
-    them: a dipole that points at the antenna above it is in its null.
+    Each stays with `stay_probability`. Bystanders carry nothing and walk back and forth between the exit and the far end
+    of the shop. Static tags lie anywhere, or, with `static_within_m`, on a grey box at most that far inwards of the exit's
+    antenna, which reads them all the time. `tags`: "object" uses the tag of each object; "level" makes all dipoles
+    horizontal in random directions, as suits ceiling antennas: a dipole that points at the antenna is in its null.
     """
     if not 1 <= tags_each <= 4:
-        raise ValueError(f"tags_each is {tags_each}; two hands carry 1 to 4 things.")
+        raise ValueError(f"tags_each is {tags_each}; expected 1 to 4 objects in two hands.")
     builder = _shop(rng, duration_s, site)
     x0, _, x1, _ = builder.room.walk_area_m
     everyone = num_people + num_bystanders
@@ -71,45 +71,47 @@ def shop_exit(
         points.append((x0 - 0.9 if leaves else rng.uniform(x1 - 1.5, x1 - 0.3), lane, 0.0))
         path = path_through(points, speed_m_s=rng.uniform(0.7, 1.2), max_acceleration_m_s2=2.0)
         walk = walk_of_length(walk_along(wait_then_move(path, rng.uniform(0.0, 1.0))), builder.steps)
-        _customer(builder, rng, walk, tags_each)
+        _add_customer(builder, rng, walk, tags_each)
     for lane in lanes[num_people:]:
-        # Near and far in turn, so that they meet those who leave.
+        # Near and far positions alternate, so that bystanders meet the people who leave.
         ends = [(rng.uniform(1.6, 3.2) if k % 2 == 0 else rng.uniform(4.2, x1 - 0.3), lane, 0.0) for k in range(12)]
         path = path_through(ends, speed_m_s=rng.uniform(0.6, 1.1), max_acceleration_m_s2=2.0)
         builder.person(make_person(rng), walk_of_length(walk_along(path), builder.steps), Hands())
     if static_within_m is None:
         add_static_tags(builder, rng, num_static_tags)
     elif num_static_tags:
-        _on_a_box(builder, rng, num_static_tags, static_within_m)
+        _add_static_tags_on_box(builder, rng, num_static_tags, static_within_m)
     if tags == "level":
-        _lay_level(builder, rng)
+        _make_dipoles_horizontal(builder, rng)
     return builder.scenario(
-        f"{num_people} people, {tags_each} tags each, {num_static_tags} still", num_antennas=3, rounds_per_antenna=2
+        f"{num_people} people, {tags_each} tags each, {num_static_tags} static tags",
+        num_antennas=3,
+        rounds_per_antenna=2,
     )
 
 
 def shop_handover(
     rng: np.random.Generator, duration_s: float, *, speed_m_s: float = 0.9, kind: str = "box", site: int | None = None
 ) -> Scenario:
-    """One person brings a thing in and hands it to another, who puts it on a box further in; both leave by the exit.
+    """One person brings an object and hands it to another, who puts it on a box farther inside; both leave by the exit.
 
-    Fig. 7 of Goller et al.: the tag is the first person's, then the second's, then the background's. They walk towards
-    each other, meet at 0.25 of the time below the second antenna and part at once, so that either carries the thing from
-    one antenna's zone to the next: within one a tag seems to rest. Its label lies level.
+    Fig. 7 of Goller et al.: the tag belongs to the first person, then to the second, then to the background. The two
+    walk towards each other, meet at 0.25 of the duration below the second antenna and part at once, so that each carries
+    the object from one antenna's zone to the next: within one zone a tag seems stationary. The dipole is horizontal.
     """
     if duration_s < 19.0:
-        raise ValueError(f"A hand-over of {duration_s} s; it takes 19 s or more.")
+        raise ValueError(f"duration_s is {duration_s}; expected at least 19 s for a hand-over.")
     builder = _shop(rng, duration_s, site)
     x0, _, x1, _ = builder.room.walk_area_m
     meet_s, meet_x, box_x = 0.25 * duration_s, float(rng.uniform(3.4, 3.8)), float(rng.uniform(5.8, 6.1))
     time_s = np.arange(builder.steps) * STEP_S
 
     def half_s(start: float, end: float) -> float:
-        """Time for half of a way."""
+        """Half of the time that a walk between two positions takes."""
         return 0.7 * abs(end - start) / speed_m_s
 
     def walk(stops: Sequence[tuple[float, float]], lane: float, heading: float) -> Walk:
-        """From the first place on through (middle of the way's time, place), standing in between."""
+        """A walk from the first position through (time at half of the way, position), with pauses in between."""
         x = np.full(builder.steps, stops[0][1])
         for (_, start), (middle_s, end) in itertools.pairwise(stops):
             x = x + (end - start) * smooth_step(np.clip((time_s - middle_s) / (2 * half_s(start, end)) + 0.5, 0, 1))
@@ -139,7 +141,7 @@ def shop_handover(
     model = make_object(kind, rng, scale=0.8)
     one, other = (carried_poses(motion.left_hand, model.grip_m) for motion in motions)
     fraction = ease(np.clip((time_s - meet_s) / 0.2 + 0.5, 0, 1))[:, None]
-    # Two who face each other hold it half a turn apart: whether it goes over left or right is settled once.
+    # The two hold it half a rotation apart: the direction of the rotation is chosen once.
     middle = int(meet_s / STEP_S)
     sign = 1.0 if one.quaternion[middle] @ other.quaternion[middle] >= 0 else -1.0
     turn = (1 - fraction) * one.quaternion + fraction * other.quaternion * sign
@@ -150,8 +152,8 @@ def shop_handover(
     top = z - model.half_size_m[2]
     stand = Shape("box", (0.16, 0.16, top / 2), _GREY)
     builder.bodies.append(Body("stand", (stand,), Poses.fixed((x, y, top / 2)), "furniture"))
-    _lay_level(builder, rng)
-    return builder.scenario("a thing is handed over in a shop", num_antennas=3, rounds_per_antenna=2)
+    _make_dipoles_horizontal(builder, rng)
+    return builder.scenario("an object is handed over in a shop", num_antennas=3, rounds_per_antenna=2)
 
 
 def grid(
@@ -164,10 +166,10 @@ def grid(
     tags: Literal["object", "level"] = "object",
     site: int | None = None,
 ) -> Scenario:
-    """A tag on a stand that rests at each point of a grid on the shop floor in turn: for antenna calibration.
+    """A tag that pauses at each point of a grid on the shop floor in turn, for antenna calibration.
 
-    `tags` as in `shop_exit`; a level label is turned by a quarter halfway through each rest, from along the
-    antennas' line to across it or back.
+    `tags` as in `shop_exit`; a level dipole is rotated by 90 degrees halfway through each pause, between along and
+    across the line of the antennas.
     """
     builder = _shop(rng, duration_s, site)
     x0, y0, x1, y1 = builder.room.walk_area_m
@@ -191,17 +193,17 @@ def grid(
     turn = np.where(turned[:, None] & (tags == "level"), turn_about(UP, np.pi / 2), [1.0, 0.0, 0.0, 0.0])
     builder.object(model, Poses(place, turn))
     if tags == "level":
-        on_top = (0.0, 0.0, float(model.half_size_m[2]))  # in the middle, so that a turn does not move it
+        on_top = (0.0, 0.0, float(model.half_size_m[2]))  # at the centre, so that a rotation does not move it
         builder.tags[0] = dataclasses.replace(builder.tags[0], position_m=on_top, dipole=(0.0, 1.0, 0.0))
-    return builder.scenario("a tag rests at each point of a grid", num_antennas=3, rounds_per_antenna=2)
+    return builder.scenario("a tag pauses at each point of a grid", num_antennas=3, rounds_per_antenna=2)
 
 
 def _shop(rng: np.random.Generator, duration_s: float, site: int | None) -> ScenarioBuilder:
     return ScenarioBuilder(make_room("shop_floor", rng if site is None else np.random.default_rng(site)), duration_s)
 
 
-def _customer(builder: ScenarioBuilder, rng: np.random.Generator, walk: Walk, num_tags: int) -> None:
-    """A person with things in the right hand and, from the second on, in the left one in turn."""
+def _add_customer(builder: ScenarioBuilder, rng: np.random.Generator, walk: Walk, num_tags: int) -> None:
+    """Add a person with objects in the right hand and, from the second object on, in the left and right hand in turn."""
     person = make_person(rng)
     left = hand_target(walk, (0.2, 0.28, 0.95)) if num_tags > 1 else None
     motion = builder.person(person, walk, Hands(right=hand_target(walk, (0.2, -0.28, 0.95)), left=left))
@@ -215,16 +217,16 @@ def _customer(builder: ScenarioBuilder, rng: np.random.Generator, walk: Walk, nu
 
 
 def _lift(first: ObjectModel, second: ObjectModel) -> float:
-    """Height to add to the second object of a hand, so that it is just above or below the first."""
+    """Vertical offset of the second object in a hand, which puts it just above or below the first."""
     room = first.half_size_m[2] + second.half_size_m[2] + 0.01
     grips = second.grip_m[2] - first.grip_m[2]
     return min(grips + room, grips - room, key=abs)
 
 
-def _on_a_box(builder: ScenarioBuilder, rng: np.random.Generator, count: int, within_m: float) -> None:
-    """Small tagged things on a grey box at a wall, up to `within_m` inwards of the first antenna."""
+def _add_static_tags_on_box(builder: ScenarioBuilder, rng: np.random.Generator, count: int, within_m: float) -> None:
+    """Add small tagged objects on a grey box at a wall, up to `within_m` inwards of the first antenna."""
     if not 1 <= count <= 4:
-        raise ValueError(f"{count} still tags; the box has place for 1 to 4.")
+        raise ValueError(f"{count} static tags; expected 1 to 4 on the box.")
     antenna, half = np.array(builder.room.antennas_m[0]), _BOX_HALF_M
     for _ in range(200):
         x = float(antenna[0] + rng.uniform(0.3, max(within_m, 0.35)))
@@ -234,7 +236,7 @@ def _on_a_box(builder: ScenarioBuilder, rng: np.random.Generator, count: int, wi
         ):
             break
     else:
-        raise ValueError(f"No place for a box within {within_m} m of the exit's antenna; try another seed.")
+        raise ValueError(f"No free position for a box within {within_m} m of the exit's antenna; try another seed.")
     top = float(rng.uniform(0.5, 0.9))
     shape = Shape("box", (half, half, top / 2), _GREY)
     builder.bodies.append(Body("grey box", (shape,), Poses.fixed((x, y, top / 2)), "furniture"))
@@ -244,8 +246,8 @@ def _on_a_box(builder: ScenarioBuilder, rng: np.random.Generator, count: int, wi
         builder.object(model, placed_object(model, spot, float(rng.uniform(0, 2 * np.pi))), labelled=False)
 
 
-def _lay_level(builder: ScenarioBuilder, rng: np.random.Generator) -> None:
-    """Every tag's dipole level, any way round (things here stay upright)."""
+def _make_dipoles_horizontal(builder: ScenarioBuilder, rng: np.random.Generator) -> None:
+    """Make every tag's dipole horizontal, in a random direction (objects here stay upright)."""
     for number, angle in enumerate(rng.uniform(0, 2 * np.pi, len(builder.tags))):
         axis = (float(np.cos(angle)), float(np.sin(angle)), 0.0)
         builder.tags[number] = dataclasses.replace(builder.tags[number], dipole=axis)

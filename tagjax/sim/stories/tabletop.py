@@ -1,4 +1,4 @@
-"""Stories of things that move over a table."""
+"""Stories of objects that move over a table."""
 
 from __future__ import annotations
 
@@ -32,10 +32,9 @@ def tabletop(
     """Toy trains on a table top of 1.5 x 3 m, seen from the ceiling.
 
     `tracks`: "loops" (rounded closed tracks, one each), "parallel" (straight lines `spacing_m` apart, the same motion),
-    "ranges" (straight lines away from below the antenna, to either side, with distances to it that differ by `spacing_m`
-    at all times), "curves" (open curves over the table). Tunnels hide every train so that the camera sees it
-    `num_traces` times, each a stretch of its own. `antenna`: "ceiling" beside the camera, or "side", at the table's edge
-    and height.
+    "ranges" (straight lines from below the antenna to either side, with ranges that differ by `spacing_m` at all times),
+    "curves" (open curves over the table). Tunnels hide every train so that it is visible in `num_traces` separate
+    intervals. `antenna`: "ceiling" is beside the camera, "side" at the table's edge and height.
     """
     if tracks not in ("loops", "parallel", "curves", "ranges"):
         raise ValueError(f"tracks is {tracks!r}; expected loops, parallel, curves or ranges.")
@@ -47,7 +46,9 @@ def tabletop(
     pace = (speed_m_s[0], speed_m_s[1])
     if tracks == "ranges":
         models = [make_object(kind, rng) for _ in range(num_objects)]
-        for model, poses in zip(models, _shunting(models, builder, time_s, rng, pace, spacing_m), strict=True):
+        for model, poses in zip(
+            models, _trains_at_range_offset(models, builder, time_s, rng, pace, spacing_m), strict=True
+        ):
             builder.object(model, poses)
     else:
         for line in _track_lines(tracks, num_objects, table.top_m, time_s, rng, pace, spacing_m):
@@ -81,7 +82,7 @@ def _track_lines(kind, count, top_m, time_s, rng, speed_m_s, spacing_m) -> list[
         return lines
     for number in range(count):
         if kind == "loops":
-            # Tracks beside each other along the table, each with its own oval.
+            # Ovals beside each other along the table, one for each train.
             span = (y1 - y0) / count
             centre = np.array([middle[0], y0 + span * (number + 0.5)])
             radius = np.array([rng.uniform(0.3, 0.55), span / 2 - 0.13])
@@ -102,15 +103,13 @@ def _track_lines(kind, count, top_m, time_s, rng, speed_m_s, spacing_m) -> list[
     return lines
 
 
-def _shunting(models, builder, time_s, rng, speed_m_s, spacing_m) -> list[Poses]:
-    """Trains that go to and fro, without turning round, on lines to either side of below the antenna.
+def _trains_at_range_offset(models, builder, time_s, rng, speed_m_s, spacing_m) -> list[Poses]:
+    """Trains that move back and forth on straight lines to either side of the point below the antenna.
 
-    The distances of their tags to the antenna differ by `spacing_m` at all times.
+    The ranges of their tags differ by `spacing_m` at all times.
     """
     if len(models) > 2:
-        raise ValueError(
-            f"{len(models)} trains on tracks of different ranges; there is room for 2, one to either side."
-        )
+        raise ValueError(f"{len(models)} trains on tracks of different ranges; expected at most 2, one to either side.")
     table, (x, y, antenna_up_m) = builder.room.tables[0], builder.room.antennas_m[0]
     near, far = 0.15, 0.6
     swing = (far - near) / 2
@@ -122,17 +121,19 @@ def _shunting(models, builder, time_s, rng, speed_m_s, spacing_m) -> list[Poses]
         if range_m is not None:
             out = np.sqrt((range_m + spacing_m) ** 2 - below**2)
         range_m = np.hypot(below, out)
-        # Headed outward, x ahead: where the middle is when the tag is at x, y + side * out.
+        # Heading outward, x ahead: position of the centre when the tag is at x, y + side * out.
         line = np.stack([x + side * model.tag_m[1] + 0 * out, y + side * (out - model.tag_m[0])], axis=-1)
         if np.any(line[:, 1] < table.top_m[1] + 0.12) or np.any(line[:, 1] > table.top_m[3] - 0.12):
-            raise ValueError(f"Tracks that differ by {spacing_m} m in range leave the table; ask for less.")
+            raise ValueError(
+                f"Tracks that differ by {spacing_m} m in range leave the table; ask for a smaller spacing_m."
+            )
         turned = turn_about(UP, np.full(len(time_s), side * np.pi / 2))
         poses.append(Poses(np.column_stack([line, np.full(len(time_s), up)]), turned))
     return poses
 
 
 _TRIES = 100
-_APART_M = 0.27  # between the middles of two things: no ball is wider
+_APART_M = 0.27  # between the centres of two objects: more than the largest ball's diameter
 
 
 def _curve(low: np.ndarray, high: np.ndarray, steps: int, rng, speed_m_s) -> np.ndarray:

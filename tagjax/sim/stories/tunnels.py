@@ -1,4 +1,4 @@
-"""Tunnels over the tracks of trains on a table, placed so that a camera sees each train a given number of times."""
+"""Tunnels over the tracks of trains on a table, placed so that each train is visible in a given number of intervals."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from .builder import UP
 
 SEEN_S = 0.5
 HIDDEN_S = 0.4
-"""Shortest intervals that count: some frames of any camera, and some reads of any tag."""
+"""Minimum length of visible and hidden intervals: several frames and several reads."""
 
-_HEIGHT_M = 0.16  # inside: the tallest train has 0.13
+_HEIGHT_M = 0.16  # inner height; the tallest train has 0.13 m
 _WALL_M = 0.006
 _GAP_M = 0.012  # between a train and a tunnel's wall
-_MOST_WIDE_M = 0.2
+_MAX_WIDTH_M = 0.2
 _TRIES = 400
-_EVERY = 5  # steps between looks: a train moves by 25 mm at the most
+_STEPS_APART = 5  # steps between visibility checks; a train moves by 25 mm at most
 _ROOF = Material((0.35, 0.3, 0.28), "speckle", 30.0, 0.3, transmission_db=1.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """Middle on the table, direction, half length and half width inside."""
+    """A tunnel's centre on the table, direction, and inner half length and half width."""
 
     middle: np.ndarray  # (2,)
     yaw: float
     half_m: tuple[float, float]
 
     def local(self, places: np.ndarray) -> np.ndarray:
-        """Places (..., 2) along and across."""
+        """Positions (..., 2) in the tunnel's frame: along and across."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         away = places - self.middle
         return np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
@@ -74,38 +74,38 @@ def tunnels(
     steps: int,
     rng: np.random.Generator,
 ) -> list[Body]:
-    """Tunnels under which every train disappears `num_traces` - 1 times, seen at the first and the last step.
+    """Tunnels that hide every train `num_traces` - 1 times; it is visible at the first and the last step.
 
-    Each stretch in sight lasts for `SEEN_S` or more, each out of sight for `HIDDEN_S`. Raises `ValueError` where none
-    of many draws does it: tracks too short, too many traces.
+    Visible intervals last at least `SEEN_S`, hidden ones at least `HIDDEN_S`. Raises `ValueError` where no draw meets
+    that: the tracks are too short, or the traces too many.
     """
     if num_traces < 1:
-        raise ValueError(f"{num_traces} traces; a train has at least 1.")
+        raise ValueError(f"num_traces is {num_traces}; expected at least 1.")
     found: list[_Plan] = []
-    looks = np.unique(np.append(np.arange(0, steps, _EVERY), steps - 1))
-    outlines = [_outline(train)[looks] for train in trains]
+    sampled = np.unique(np.append(np.arange(0, steps, _STEPS_APART), steps - 1))
+    outlines = [_outline(train)[sampled] for train in trains]
     for number, train in enumerate(trains):
         for _ in range(_TRIES):
             mine = _draw(outlines, number, table, found, num_traces, rng)
             covers = [plan.body(table.height_m) for plan in (*found, *(mine or ()))]
-            if mine is not None and _counts(train, covers, num_traces, camera_m, looks):
+            if mine is not None and _has_traces(train, covers, num_traces, camera_m, sampled):
                 found += mine
                 break
         else:
             raise ValueError(
-                f"No place for tunnels that leave train {number + 1} {num_traces} traces in "
-                f"{(steps - 1) * STEP_S:.1f} s; give it more time or speed, or ask for fewer traces."
+                f"No positions for tunnels that leave train {number + 1} {num_traces} traces in "
+                f"{(steps - 1) * STEP_S:.1f} s; give more time or speed, or ask for fewer traces."
             )
     bodies = [plan.body(table.height_m) for plan in found]
     for number, train in enumerate(trains):
         # The tunnels of a later train may hide an earlier one.
-        if not _counts(train, bodies, num_traces, camera_m, looks):
+        if not _has_traces(train, bodies, num_traces, camera_m, sampled):
             raise ValueError(f"The tunnels of other trains hide train {number + 1}; try another seed.")
     return bodies
 
 
 def _outline(train: Body) -> np.ndarray:
-    """Corners (steps, 4, 2) of a train's floor plan."""
+    """Corners (steps, 4, 2) of a train's outline on the table."""
     low, high = bounds(train.shapes)
     corners = np.array([(x, y, 0.0) for x in (low[0], high[0]) for y in (low[1], high[1])])
     turn = rotation_matrix(train.poses.quaternion)
@@ -113,10 +113,10 @@ def _outline(train: Body) -> np.ndarray:
 
 
 def _draw(outlines, number, table, taken, num_traces, rng) -> list[_Plan] | None:
-    """Up to `num_traces` - 1 tunnels at places that the train passes at well separated times; None if one is in the way."""
+    """Up to `num_traces` - 1 tunnels that the train passes at well separated times; None if one does not fit."""
     line = outlines[number].mean(axis=1)
     train_m = float(np.linalg.norm(outlines[number][0, 2] - outlines[number][0, 0]))
-    between_s = _EVERY * STEP_S
+    between_s = _STEPS_APART * STEP_S
     margin = round((SEEN_S + HIDDEN_S) / between_s)
     count = int(rng.integers(1, num_traces)) if num_traces > 1 else 0
     edges = np.linspace(margin, len(line) - margin, count + 1)
@@ -130,22 +130,22 @@ def _draw(outlines, number, table, taken, num_traces, rng) -> list[_Plan] | None
         ahead = line[at + 1] - line[at - 1]
         pace = float(np.linalg.norm(ahead)) / (2 * between_s)
         long = 0.5 * (train_m + rng.uniform(1.4, 2.2) * HIDDEN_S * max(pace, 0.2)) + 0.02
-        plan = _fitted(line[at], float(np.arctan2(ahead[1], ahead[0])), long, outlines[number])
-        if plan is None or not _stands(plan, outlines, number, table):
+        plan = _narrowest(line[at], float(np.arctan2(ahead[1], ahead[0])), long, outlines[number])
+        if plan is None or not _fits(plan, outlines, number, table):
             return None
         if any(plan.meets(other) for other in (*taken, *plans)):
             return None
         plans.append(plan)
-    # Before any line of sight is looked at: how often is the whole train inside?
+    # A fast check before lines of sight are computed: how often is the whole train inside?
     under = np.zeros(len(outlines[number]), bool)
     for plan in plans:
         under |= np.all(np.abs(plan.local(outlines[number])) < plan.half_m, axis=(1, 2))
     return plans if len(intervals(under)) == num_traces - 1 else None
 
 
-def _fitted(place: np.ndarray, yaw: float, long: float, outline: np.ndarray) -> _Plan | None:
-    """The narrowest tunnel of a half length at a place of the track that the train passes without touching it."""
-    plan = _Plan(place, yaw, (long, _MOST_WIDE_M))
+def _narrowest(place: np.ndarray, yaw: float, long: float, outline: np.ndarray) -> _Plan | None:
+    """The narrowest tunnel of a half length at a position of the track that the train passes without touching it."""
+    plan = _Plan(place, yaw, (long, _MAX_WIDTH_M))
     corners = plan.local(outline)
     within = np.any(np.abs(corners[..., 0]) < long + 0.01, axis=1) & np.all(np.abs(corners[..., 1]) < 0.3, axis=1)
     if not within.any():
@@ -153,11 +153,11 @@ def _fitted(place: np.ndarray, yaw: float, long: float, outline: np.ndarray) -> 
     low, high = corners[within][..., 1].min(), corners[within][..., 1].max()
     wide = (high - low) / 2 + _GAP_M
     middle = place + 0.5 * (low + high) * np.array([-np.sin(yaw), np.cos(yaw)])
-    return _Plan(middle, yaw, (long, float(wide))) if wide <= _MOST_WIDE_M else None
+    return _Plan(middle, yaw, (long, float(wide))) if wide <= _MAX_WIDTH_M else None
 
 
-def _stands(plan: _Plan, outlines: Sequence[np.ndarray], number: int, table: Table) -> bool:
-    """Whether a tunnel stands on the table, no train meets its walls, and only its own goes through."""
+def _fits(plan: _Plan, outlines: Sequence[np.ndarray], number: int, table: Table) -> bool:
+    """Whether a tunnel is on the table, no train touches its walls, and only its own train goes through."""
     x0, y0, x1, y1 = table.top_m
     corners = plan.corners(_WALL_M)
     if np.any(corners < [x0, y0]) or np.any(corners > [x1, y1]):
@@ -173,11 +173,11 @@ def _stands(plan: _Plan, outlines: Sequence[np.ndarray], number: int, table: Tab
     return True
 
 
-def _counts(train: Body, covers: Sequence[Body], num_traces: int, camera_m, looks: np.ndarray) -> bool:
-    """Whether a camera sees a train in so many intervals, each long enough, beginning and ending in sight."""
-    scene = World((train, *covers), (), int(looks[-1]) + 1, (1.0, 1.0, 1.0))
-    seen = visible_fraction(scene, (0,), camera_m, looks) > 0
+def _has_traces(train: Body, covers: Sequence[Body], num_traces: int, camera_m, sampled: np.ndarray) -> bool:
+    """Whether a train is visible in exactly `num_traces` intervals, all long enough, and at the start and the end."""
+    scene = World((train, *covers), (), int(sampled[-1]) + 1, (1.0, 1.0, 1.0))
+    seen = visible_fraction(scene, (0,), camera_m, sampled) > 0
     if not (seen[0] and seen[-1]):
         return False
-    shown, hidden = (np.diff(intervals(flag), axis=1) * _EVERY * STEP_S for flag in (seen, ~seen))
+    shown, hidden = (np.diff(intervals(flag), axis=1) * _STEPS_APART * STEP_S for flag in (seen, ~seen))
     return len(shown) == num_traces and bool(shown.min() >= SEEN_S and hidden.min(initial=np.inf) >= HIDDEN_S)

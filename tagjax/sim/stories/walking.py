@@ -1,4 +1,4 @@
-"""Stories of people who walk: towards the sensor and away, and about in a crowd."""
+"""Stories of walking people: towards the sensor and away, in a crowd, and with badges in an open hall."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def approach(
     kind: str | None = None,
     speed_m_s: float = 0.8,
 ) -> Scenario:
-    """A person walks towards the sensor and away again, round and round, a badge on the chest.
+    """A person with a badge on the chest walks towards the sensor and away again, in a narrow loop.
 
-    With a `kind` it is an object of that kind, in the right hand, that is tagged and labelled instead of the person.
-    Straight legs are walked at `speed_m_s` once it is reached; the narrow turns at the ends, to the right, are slower,
-    and the object, on their inner side, never moves faster than the person does on the legs.
+    With a `kind`, an object of that kind in the right hand is tagged and labelled instead of the person. The person walks
+    at `speed_m_s` on the straight parts. The narrow right turns at the ends are slower, and the object, on their inner
+    side, never moves faster than the person does on the straight parts.
     """
     builder = ScenarioBuilder(make_room(room, rng), duration_s)
-    # Slow enough in the turns that the object, which is farther from their middle than the person, is not the faster.
+    # Slow enough in the turns that the object, farther from the centre of the turn, is not faster than the person.
     push = min(3.0, 2.8 * speed_m_s**2)
-    # Speeding up and braking take a length; a leg is longer by what is walked in 0.3 s.
-    least = 1.2 * speed_m_s**2 / push + 0.3 * speed_m_s + 2 * _TURN_M
-    near, far, y = _lane(builder.room, rng, max(least, 1.8))
+    # The straight part is long enough for acceleration, braking, and 0.3 s at full speed.
+    min_length = 1.2 * speed_m_s**2 / push + 0.3 * speed_m_s + 2 * _TURN_M
+    near, far, y = _lane(builder.room, rng, max(min_length, 1.8))
     laps = int(np.ceil(speed_m_s * duration_s / (2 * (far - near)))) + 1
     path = path_through(_loops(near, far, y, laps), speed_m_s=speed_m_s, max_acceleration_m_s2=push)
     walk = walk_of_length(walk_along(path), builder.steps)
@@ -47,29 +47,29 @@ def approach(
         motion = builder.person(person, walk, Hands(right=hand_target(walk, (0.26, -0.16, 1.0))))
         builder.object(model, carried_poses(motion.right_hand, model.grip_m))
     return builder.scenario(
-        f"a person walks to and fro at {speed_m_s} m/s", look_at_m=((near + far) / 2, 0.5 * y, 0.95)
+        f"a person walks back and forth at {speed_m_s} m/s", look_at_m=((near + far) / 2, 0.5 * y, 0.95)
     )
 
 
 _TURN_M = 0.25  # radius of the turn at the ends
 
 
-def _lane(room: Room, rng: np.random.Generator, least_m: float) -> tuple[float, float, float]:
-    """Near end, far end and middle (x, x, y) of a free lane towards the camera, at least so long."""
+def _lane(room: Room, rng: np.random.Generator, min_length_m: float) -> tuple[float, float, float]:
+    """Near end, far end and centre (x, x, y) of a free lane towards the camera, at least `min_length_m` long."""
     _, y0, x1, y1 = room.walk_area_m
     camera = room.camera_position_m
     near = camera[0] + 1.4
     for _ in range(500):
-        far = near + rng.uniform(least_m, max(least_m, 2.9))
+        far = near + rng.uniform(min_length_m, max(min_length_m, 2.9))
         y = camera[1] + rng.uniform(-0.8, 0.8)
         places = [(x, y + side * _TURN_M) for x in np.linspace(near, far, 20) for side in (-1, 1)]
         if all(is_free(np.array(place), (near, y0, x1, y1), room.obstacles_m, 0.33) for place in places):
             return near, float(far), float(y)
-    raise ValueError(f"No free lane of {least_m:.1f} m towards the camera in the {room.name}; try another seed.")
+    raise ValueError(f"No free lane of {min_length_m:.1f} m towards the camera in the {room.name}; try another seed.")
 
 
 def _loops(near: float, far: float, y: float, laps: int) -> np.ndarray:
-    """Points (points, 3) of a narrow loop, walked clockwise from its far end: in at y - r, back at y + r."""
+    """Points (points, 3) of a narrow clockwise loop from its far end: towards the camera at y - r, back at y + r."""
     r = _TURN_M
     turn = np.linspace(-np.pi / 2, np.pi / 2, 7)
     legs = np.linspace(far - r, near + r, max(3, round((far - near) / 0.4)))
@@ -93,9 +93,9 @@ def crowd(
     num_door: int = 0,
     num_static_tags: int = 0,
 ) -> Scenario:
-    """People walk about, each with an object in one hand or in both; `num_door` of them enter and leave."""
+    """People walk about with an object in one hand or in both; `num_door` of them enter and leave through a door."""
     if objects_each not in (1, 2):
-        raise ValueError(f"objects_each is {objects_each}; people have two hands: 1 or 2.")
+        raise ValueError(f"objects_each is {objects_each}; expected 1 or 2, one for each hand.")
     builder = ScenarioBuilder(make_room(room, rng), duration_s)
     walks = random_walks(
         num_people,
@@ -109,7 +109,7 @@ def crowd(
     )
     for walk in walks:
         walk = walk_of_length(walk, builder.steps)
-        swing = [builder.inside(waving_hand(walk, side, rng, duration_s, 0.5, 0.0)) for side in (-1, 1)]
+        swing = [builder.inside_room(waving_hand(walk, side, rng, duration_s, 0.5, 0.0)) for side in (-1, 1)]
         hands = Hands(right=swing[0], left=swing[1] if objects_each == 2 else None)
         person = make_person(rng)
         motion = builder.person(person, walk, hands)

@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 
 STEP_S = 0.01
-"""Sampling of every motion: frames and reads fall on, or are interpolated between, these times."""
+"""Sampling period of every motion. Frames and reads are interpolated between these times."""
 
 MIN_APART_M = 0.01
-"""Two objects whose middles are nearer to each other than this at the start are in one place."""
+"""Objects whose centres are closer than this at the start count as placed at the same spot."""
 
 METAL_REFLECTION = -0.95
 """Field reflection coefficient from which a material counts as metal, which lets no radio wave through."""
@@ -34,14 +34,14 @@ class Material:
     contrast: float = 0.3  # 0 = plain
     photo: str = ""  # name of a photograph, where texture is "photo"
     seed: int = 0
-    shine: float = 0.0  # 0 matt to 1 mirror: highlights, and lost depth
-    transmission_db: float = 20.0  # one-way loss of a radio wave that passes through a body of it
-    reflection: float = -0.3  # field reflection coefficient of a plane of it; metal is -1
+    shine: float = 0.0  # 0 matt to 1 mirror: causes highlights and missing depth
+    transmission_db: float = 20.0  # one-way loss of a radio wave that passes through the body
+    reflection: float = -0.3  # field reflection coefficient of a plane of this material; metal is -1
 
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A convex part of a body, fixed in the body's frame; sizes as MuJoCo has them (half lengths, radius first)."""
+    """A convex part of a body, fixed in the body's frame. Sizes follow MuJoCo: half lengths, radius first."""
 
     kind: ShapeKind
     size_m: tuple[float, float, float]  # box: half x y z; capsule, cylinder: radius, half length, 0; sphere: radius
@@ -52,7 +52,7 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Poses:
-    """Where a body is at every step: position (steps, 3) and unit quaternion w x y z (steps, 4); one row = at rest."""
+    """Pose of a body at every step: position (steps, 3), unit quaternion w x y z (steps, 4). One row: it never moves."""
 
     position_m: np.ndarray
     quaternion: np.ndarray
@@ -68,16 +68,16 @@ class Poses:
         return len(self.position_m) > 1
 
     def at(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Position and quaternion at a step; the last one is held."""
+        """Position and quaternion at a step; after the last step they stay as they are."""
         index = min(step, len(self.position_m) - 1)
         return self.position_m[index], self.quaternion[index]
 
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """Shapes that move together (a limb, an object, a table). `label` is its value in the masks, 0 for the room.
+    """Shapes that move together (a limb, an object, a table). `label` is the value in the label masks, 0 for the room.
 
-    The limbs of a person fraction a `name`, and a label if the person is to be labelled.
+    All limbs of a person have the same `name`, and the same label if the person is labelled.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class Tag:
-    """A tag fixed to a body: index into the world's bodies, place and dipole direction in the body's frame."""
+    """A tag fixed to a body: index into the world's bodies, position and dipole direction in the body's frame."""
 
     epc: str
     body: int
@@ -107,7 +107,7 @@ class Light:
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """Everything there is, for `num_steps` steps of `STEP_S`. `size_m` is the room's length, width, height."""
+    """All bodies, tags and lights for `num_steps` steps of `STEP_S`. `size_m` is the room's length, width, height."""
 
     bodies: tuple[Body, ...]
     tags: tuple[Tag, ...]
@@ -120,12 +120,12 @@ class World:
     note: str = ""
 
     def check(self) -> None:
-        """Raise `ValueError` for a world that cannot be.
+        """Raise `ValueError` for an impossible world.
 
-        No step, a tag without a body or outside the room, two objects that start in one place.
+        That is a world without steps, with a tag that has no body or leaves the room, or with two objects at one spot.
         """
         if self.num_steps < 1:
-            raise ValueError(f"A world of {self.num_steps} steps; at least 1 is needed.")
+            raise ValueError(f"num_steps is {self.num_steps}; expected at least 1.")
         for body in self.bodies:
             rows = len(body.poses.position_m)
             if rows not in (1, self.num_steps):
@@ -139,11 +139,13 @@ class World:
                 if apart < MIN_APART_M:
                     raise ValueError(
                         f"{other.name} and {one.name} start {apart * 1e3:.0f} mm apart; objects need "
-                        f"{MIN_APART_M * 1e3:.0f} mm between their middles. Place one elsewhere."
+                        f"{MIN_APART_M * 1e3:.0f} mm between their centres. Place one elsewhere."
                     )
         for tag in self.tags:
             if not 0 <= tag.body < len(self.bodies):
-                raise ValueError(f"Tag {tag.epc}: body {tag.body}; there are {len(self.bodies)}.")
+                raise ValueError(
+                    f"Tag {tag.epc}: body is {tag.body}; expected an index below {len(self.bodies)}, the number of bodies."
+                )
             path = tag_path(self, tag)
             low, high = path.min(axis=0), path.max(axis=0)
             length, width, height = self.size_m
@@ -166,7 +168,7 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def tag_path(world: World, tag: Tag) -> np.ndarray:
-    """World position of a tag at every step, (num_steps, 3); one row's worth repeated where the body rests."""
+    """World position of a tag at every step, (num_steps, 3); constant where the body never moves."""
     poses = world.bodies[tag.body].poses
     path = poses.position_m + rotation_matrix(poses.quaternion) @ np.asarray(tag.position_m)
     return np.broadcast_to(path, (world.num_steps, 3)) if len(path) == 1 else path

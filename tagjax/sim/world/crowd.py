@@ -1,4 +1,4 @@
-"""Several walkers on one floor: way points, keeping apart, round furniture, in and out through a door."""
+"""Several walkers on one floor: way points, distances to each other and to furniture, in and out through a door."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Rectangle = tuple[float, float, float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Door:
-    """A way out of sight: the opening, and places behind it where people wait unseen, the innermost first."""
+    """A door: its opening, and places behind it that the camera does not see, the one farthest from the door first."""
 
     opening_m: tuple[float, float]
     outside_m: tuple[tuple[float, float], ...]
@@ -21,8 +21,8 @@ class Door:
 BODY_RADIUS_M = 0.28
 """Kept free between a walker's centre and furniture."""
 
-_BRAKE = 0.45  # fraction of the acceleration bound that is planned for braking; the rest turns and gives way
-_MARGIN_M = 0.12  # planned on top of the distance to keep
+_BRAKE = 0.45  # fraction of the acceleration bound planned for braking; the remainder is for turning and evading
+_MARGIN_M = 0.12  # planned in addition to the minimum distance
 
 
 def distance_to(rectangle: Rectangle, place: np.ndarray) -> tuple[np.ndarray | np.floating, np.ndarray]:
@@ -46,20 +46,20 @@ def is_free(place: np.ndarray, area: Rectangle, obstacles: tuple[Rectangle, ...]
 
 
 class _Walker:
-    """State of one walker: where it is, where it goes, how fast, and whether it waits or stands outside."""
+    """State of one walker: position, velocity, goals, speed, waiting time, and whether it is behind the door."""
 
     def __init__(self, place: np.ndarray, speed: float):
         self.place, self.velocity = place, np.zeros(2)
         self.goals: list[np.ndarray] = []
         self.speed, self.wait, self.stuck = speed, 0.0, 0.0
-        self.through_door = False  # then the area's limits do not hold
+        self.through_door = False  # then the area's limits do not apply
         self.enter_s = self.leave_s = np.inf
         self.home = place
-        self.inner: _Walker | None = None  # whoever waits behind and has to be back home first
-        self.outer: _Walker | None = None  # whoever stands in the way out and has to go first
+        self.inner: _Walker | None = None  # the person farther inside, who has to be back first
+        self.outer: _Walker | None = None  # the person nearer to the door, who has to go first
 
     def is_home(self) -> bool:
-        """Back behind the door, for good."""
+        """Whether the walker is back behind the door and stays there."""
         return self.through_door and not self.goals and bool(np.hypot(*(self.home - self.place)) < 0.3)
 
 
@@ -84,13 +84,13 @@ def simulate(
         now = step * step_s
         for i, walker in enumerate(walkers):
             place[step, i], velocity[step, i] = walker.place, walker.velocity
-        # Everybody decides on what all saw at this step: the order of walkers does not matter.
+        # All decide on the positions at the start of this step, so the order of walkers does not matter.
         for i, walker in enumerate(walkers):
             _choose_goal(walker, now, step_s, rng, area, obstacles, speed_m_s, door, stop_probability)
-            wanted = _wanted(walker, acceleration)
-            wanted = _give_way(wanted, i, place[step], min_distance_m)
+            wanted = _desired_velocity(walker, acceleration)
+            wanted = _evade(wanted, i, place[step], min_distance_m)
             normals, limits = _limits(i, walker, place[step], area, obstacles, min_distance_m, acceleration)
-            allowed = _within(wanted, normals, limits)
+            allowed = _project_to_limits(wanted, normals, limits)
             change = allowed - walker.velocity
             size = float(np.hypot(*change))
             walker.velocity = walker.velocity + change * min(1.0, acceleration * step_s / max(size, 1e-12))
@@ -124,20 +124,20 @@ def _start(num, rng, area, obstacles, min_distance, door, num_door, duration, sp
                 break
         else:
             raise ValueError(
-                f"No free place for walker {number + 1} of {num} at {min_distance} m from the others in {area}: "
+                f"No free place for walker {number + 1} of {num} at {min_distance} m from the others in {area}; ask for "
                 "fewer walkers, less furniture or a larger area."
             )
     return walkers
 
 
 def _choose_goal(walker, now, step_s, rng, area, obstacles, speeds, door, stop_probability) -> None:
-    """Next way point when the last is reached, given up, or the door calls."""
+    """Set the next way point when the last one is reached or given up, or when it is time for the door."""
     if door is not None and now >= walker.enter_s and (walker.outer is None or not walker.outer.through_door):
         walker.enter_s = np.inf
         walker.goals = [np.array(door.opening_m), _free_place(rng, np.array(door.opening_m), area, obstacles)]
     leaves = door is not None and now >= walker.leave_s and not walker.through_door
     if door is not None and leaves and (walker.inner is None or walker.inner.is_home()):
-        # The opening may lie behind furniture: then first to a place from where it is in sight.
+        # The opening may lie behind furniture: then walk first to a place with a straight way to it.
         opening = np.array(door.opening_m)
         if is_walkable(walker.place, opening, obstacles):
             walker.leave_s, walker.through_door, walker.wait = np.inf, True, 0.0
@@ -166,14 +166,14 @@ def _choose_goal(walker, now, step_s, rng, area, obstacles, speeds, door, stop_p
 
 
 def is_walkable(start: np.ndarray, end: np.ndarray, obstacles: tuple[Rectangle, ...]) -> bool:
-    """Whether one can walk straight there: sampled every 0.1 m."""
+    """Whether a straight walk is free of obstacles, sampled every 0.1 m."""
     count = int(np.hypot(*(end - start)) / 0.1) + 2
     line = start + np.linspace(0, 1, count)[:, None] * (end - start)
     return not obstacles or bool(_to_all(obstacles, line)[1].min() >= BODY_RADIUS_M)
 
 
 def _free_place(rng, start: np.ndarray, area: Rectangle, obstacles: tuple[Rectangle, ...]) -> np.ndarray:
-    """A random free place in sight of `start`; the farthest of a few, so that walks are not all short."""
+    """A random free place with a straight way from `start`: the farther of two, so that walks are not all short."""
     best, best_length = start, -1.0
     found = 0
     for _ in range(40):
@@ -188,8 +188,8 @@ def _free_place(rng, start: np.ndarray, area: Rectangle, obstacles: tuple[Rectan
     return best
 
 
-def _wanted(walker: _Walker, acceleration: float) -> np.ndarray:
-    """Velocity towards the goal, slowing down in time for it."""
+def _desired_velocity(walker: _Walker, acceleration: float) -> np.ndarray:
+    """Desired velocity towards the goal, with braking in time."""
     if walker.wait > 0 or not walker.goals:
         return np.zeros(2)
     toward = walker.goals[0] - walker.place
@@ -198,8 +198,8 @@ def _wanted(walker: _Walker, acceleration: float) -> np.ndarray:
     return toward / max(distance, 1e-6) * min(walker.speed, max(brake, 0.05))
 
 
-def _give_way(wanted: np.ndarray, i: int, places: np.ndarray, min_distance: float) -> np.ndarray:
-    """Veer to the right of whoever is ahead, the more the nearer."""
+def _evade(wanted: np.ndarray, i: int, places: np.ndarray, min_distance: float) -> np.ndarray:
+    """Turn to the right of people ahead, more strongly the nearer they are."""
     pace = float(np.hypot(*wanted))
     if pace < 0.05:
         return wanted
@@ -215,14 +215,14 @@ def _give_way(wanted: np.ndarray, i: int, places: np.ndarray, min_distance: floa
 
 
 def _limits(i, walker, places, area, obstacles, min_distance, acceleration) -> tuple[np.ndarray, np.ndarray]:
-    """Half planes normal . velocity <= limit in which one can still brake in time, whatever the others do."""
+    """Half planes normal . velocity <= limit within which braking in time is possible, whatever the others do."""
     brake = _BRAKE * acceleration
     normals, gaps = [], []
     for j, other in enumerate(places):
         if j != i:
             toward = other - places[i]
             distance = float(np.hypot(*toward))
-            # Each of the two answers for half of the gap.
+            # Each of the two may use half of the gap.
             normals.append(toward / max(distance, 1e-9))
             gaps.append((distance - min_distance - _MARGIN_M) / 2)
     if obstacles:
@@ -241,13 +241,13 @@ def _limits(i, walker, places, area, obstacles, min_distance, acceleration) -> t
             gaps.append(gap)
     if not normals:
         return np.zeros((0, 2)), np.zeros(0)
-    # Closer than allowed: move away, gently.
+    # Closer than allowed: move away slowly.
     gap = np.array(gaps)
     return np.array(normals), np.where(gap > 0, np.sqrt(2 * brake * np.maximum(gap, 0)), 1.5 * np.maximum(gap, -0.2))
 
 
-def _within(wanted: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Near the wanted velocity within all half planes: projected in turn, then shrunk, for zero is (almost) in all."""
+def _project_to_limits(wanted: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """A velocity within all half planes near the desired one: projected onto each, then scaled down (zero is within all)."""
     velocity = wanted
     for _ in range(4):
         excess = normals @ velocity - limits

@@ -1,4 +1,4 @@
-"""A person's proportions, the shapes of the limbs in frames that `people` poses, and two-bone inverse kinematics."""
+"""A person's proportions, the shapes of the limbs in their own frames, and two-bone inverse kinematics."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from .bodies import Material, Poses, Shape
 from .rotation import continuous, frame, quaternion_of, unit
 
 REACH = 0.999
-"""Of a limb's length: a straight joint has no direction to bend."""
+"""Largest fraction of a limb's length that is used: a straight joint has no direction to bend."""
 
-_ACROSS = (0.7071067811865476, 0.7071067811865476, 0.0, 0.0)  # z to y: a capsule from side to side
+_ACROSS = (0.7071067811865476, 0.7071067811865476, 0.0, 0.0)  # rotates z to y: a capsule from side to side
 
 
 @dataclasses.dataclass(frozen=True)
 class Measures:
-    """Lengths in metres. Heights of the trunk count from the joint below."""
+    """Lengths in metres. Heights of the trunk are measured from the joint below."""
 
     ankle: float  # above the floor
     ball: float  # of the foot, ahead of the ankle
@@ -36,7 +36,7 @@ class Measures:
 
 @dataclasses.dataclass(frozen=True)
 class PersonModel:
-    """Height, build (1 = average girth), materials and dress of a person."""
+    """Height, build (1 = average girth), materials and clothing of a person."""
 
     height_m: float
     build: float
@@ -50,7 +50,7 @@ class PersonModel:
 
     @property
     def measures(self) -> Measures:
-        """Lengths by Winter's fractions of the height; the grip is 0.06 of it beyond the wrist."""
+        """Lengths as fractions of the height (Winter, 2009); the grip is 0.06 of the height beyond the wrist."""
         fractions = Measures(
             ankle=0.039,
             ball=0.085,
@@ -81,7 +81,7 @@ def limb_shapes(model: PersonModel) -> dict[str, tuple[Shape, ...]]:
     arm = _radio(shirt, 4.0)
     bare = arm if model.sleeves == "long" else skin
     leg = _radio(trousers, 8.0)
-    # The head holds water too, but less of it than the trunk.
+    # The head contains water too, but less than the trunk.
     face = _radio(skin, 10.0)
 
     def bone(radius: float, length: float, material: Material) -> Shape:
@@ -142,14 +142,14 @@ def limb_shapes(model: PersonModel) -> dict[str, tuple[Shape, ...]]:
 
 
 def _radio(material: Material, transmission_db: float) -> Material:
-    """The same cloth round a thinner part of the body."""
+    """The same cloth with the radio loss of a thinner part of the body."""
     return dataclasses.replace(material, transmission_db=transmission_db)
 
 
 def two_bone_joints(
     root: np.ndarray, end: np.ndarray, pole: np.ndarray, first_m: float, second_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Middle joint and end (steps, 3) of two bones from `root` to `end`, bent towards `pole`; the end is clamped."""
+    """Middle joint and end (steps, 3) of two bones from `root` to `end`, bent towards `pole`. The end is kept in reach."""
     toward = end - root
     distance = np.linalg.norm(toward, axis=-1, keepdims=True)
     far = np.clip(distance, abs(first_m - second_m) + 1e-3, REACH * (first_m + second_m))

@@ -1,4 +1,4 @@
-"""Walls and pieces of furniture that rooms are made of, each a body with the floor that it takes."""
+"""Walls and pieces of furniture: each is a body with the rectangle of the floor that it occupies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WALL_REFLECTION = -0.5
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """A flat reflector for the radio: middle, unit normal, unit direction along, half sizes along and across."""
+    """A flat reflector for the radio: centre, unit normal, unit direction along it, half sizes along and across."""
 
     centre_m: tuple[float, float, float]
     normal: tuple[float, float, float]
@@ -34,7 +34,7 @@ class Table:
 
 @dataclasses.dataclass
 class Plan:
-    """A room in the making."""
+    """The contents of a room while it is being furnished."""
 
     bodies: list[Body] = dataclasses.field(default_factory=list)
     obstacles: list[Rectangle] = dataclasses.field(default_factory=list)
@@ -42,12 +42,12 @@ class Plan:
     panels: list[Panel] = dataclasses.field(default_factory=list)
 
     def is_free(self, rectangle: Rectangle, gap: float = 0.05) -> bool:
-        """Whether nothing taken lies within `gap` of a rectangle."""
+        """Whether a rectangle is at least `gap` from everything that stands on the floor."""
         x0, y0, x1, y1 = rectangle
         return all(x0 - gap > b[2] or x1 + gap < b[0] or y0 - gap > b[3] or y1 + gap < b[1] for b in self.obstacles)
 
     def block(self, name: str, low, high, material: Material, role: Role = "room", *, solid: bool = True) -> None:
-        """A box between two corners; `solid` ones keep walkers out."""
+        """Add a box between two corners; `solid` ones are obstacles for walkers."""
         low, high = np.asarray(low, float), np.asarray(high, float)
         half = (high - low) / 2
         shape = Shape("box", (float(half[0]), float(half[1]), float(half[2])), material)
@@ -67,7 +67,7 @@ def surface(rng: np.random.Generator, low: float, high: float, **settings) -> Ma
 
 
 def metal(rng: np.random.Generator) -> Material:
-    """Painted sheet steel: opaque to the radio and a mirror for it."""
+    """Painted sheet steel: blocks and reflects radio waves."""
     return surface(
         rng, 0.15, 0.7, texture="noise", scale=3.0, contrast=0.08, shine=float(rng.uniform(0.3, 0.8)),
         transmission_db=30.0, reflection=METAL_REFLECTION,
@@ -77,7 +77,7 @@ def metal(rng: np.random.Generator) -> Material:
 def walls(plan: Plan, rng: np.random.Generator, size) -> None:
     """Floor, ceiling, far wall and both sides of a room (x 0 to length, y centred), 0.1 m thick, outside it.
 
-    There is no near wall: the camera stands there.
+    There is no near wall: the camera is there.
     """
     length, width, height = size
     wall = surface(rng, 0.45, 0.85, scale=float(rng.uniform(1, 3)), reflection=WALL_REFLECTION, transmission_db=12.0)
@@ -106,9 +106,9 @@ def walls(plan: Plan, rng: np.random.Generator, size) -> None:
 def doorway(
     plan: Plan, rng: np.random.Generator, size, x: float, y: float, *, wide: float = 1.1, tall: float = 2.05
 ) -> None:
-    """A wall across a room at `x` with an opening about `y`, its frame and open leaf; a dark corridor lies behind it.
+    """A wall across a room at `x` with a door opening at `y`, frame and open door leaf; a dark corridor lies behind it.
 
-    The corridor reaches from the wall to the far end of the room, over its whole width.
+    The corridor extends from the wall to the far end of the room, over the whole width.
     """
     length, width, height = size
     w, thick, hinge = width / 2, 0.1, 1.0 if y < 0 else -1.0
@@ -127,7 +127,7 @@ def doorway(
         plan.block("door frame", (x - 0.015, low, 0), (x, high, tall + trim), wood, solid=False)
     low, high = y - wide / 2, y + wide / 2
     plan.block("door frame", (x - 0.015, low, tall), (x, high, tall + trim), wood, solid=False)
-    # The leaf stands open, flat against the wall.
+    # The door leaf is open, flat against the wall.
     low, high = sorted((y + hinge * (wide / 2 + trim), y + hinge * (1.5 * wide + trim)))
     plan.block("door leaf", (x - 0.055, low, 0.01), (x - 0.015, high, tall), wood, "furniture")
     end = y + hinge * (1.5 * wide + trim - 0.08)
@@ -142,7 +142,7 @@ def doorway(
 
 
 def pictures(plan: Plan, rng: np.random.Generator, size, num: int) -> None:
-    """Flat pictures on the far wall and the sides, for texture above the furniture; a third of them a photograph."""
+    """Flat pictures on the far and side walls, for texture above the furniture; a third of them are photographs."""
     length, width, _ = size
     for _ in range(num):
         a, b, z = rng.uniform(0.2, 0.6), rng.uniform(0.15, 0.4), rng.uniform(1.4, 1.8)
@@ -191,7 +191,7 @@ def table(plan: Plan, rng: np.random.Generator, top: Rectangle, height: float = 
 
 
 def chair(plan: Plan, rng: np.random.Generator, place: tuple[float, float], turn_rad: float, cloth: Material) -> bool:
-    """A chair with its back behind it, if there is room; whether there was."""
+    """Add a chair if there is room for it; returns whether there was."""
     taken = (place[0] - 0.27, place[1] - 0.27, place[0] + 0.27, place[1] + 0.27)
     if not plan.is_free(taken, 0.0):
         return False
@@ -215,7 +215,7 @@ def chair(plan: Plan, rng: np.random.Generator, place: tuple[float, float], turn
 
 
 def cabinet(plan: Plan, rng: np.random.Generator, taken: Rectangle, height: float, front: tuple[float, float]) -> None:
-    """A metal cabinet with drawers on the side that `front` (an axis direction) names, and its front as a reflector."""
+    """A metal cabinet with drawers on the side given by `front` (an axis direction), which also reflects radio waves."""
     x0, y0, x1, y1 = taken
     skin = metal(rng)
     half = ((x1 - x0) / 2, (y1 - y0) / 2)
@@ -236,7 +236,7 @@ def cabinet(plan: Plan, rng: np.random.Generator, taken: Rectangle, height: floa
 
 
 def shelf(plan: Plan, rng: np.random.Generator, taken: Rectangle, height: float, levels: int) -> None:
-    """A metal shelf with goods on its levels; the boards are places for things."""
+    """A metal shelf with goods on its levels; objects can be placed on the boards."""
     x0, y0, x1, y1 = taken
     cx, cy, hx, hy = (x0 + x1) / 2, (y0 + y1) / 2, (x1 - x0) / 2, (y1 - y0) / 2
     board = metal(rng)
@@ -260,10 +260,10 @@ def shelf(plan: Plan, rng: np.random.Generator, taken: Rectangle, height: float,
     plan.obstacles.append(taken)
     front = -1.0 if cy > 0 else 1.0
     at_front = (cx, cy + front * hy, height / 2)
-    # A shelf is half open: half the field of a sheet.
+    # A shelf is half open: it reflects half the field of a sheet.
     plan.panels.append(Panel(at_front, (0.0, front, 0.0), (1.0, 0.0, 0.0), (hx, height / 2), METAL_REFLECTION / 2))
 
 
 def distance_to_nearest(obstacles: tuple[Rectangle, ...], place: np.ndarray) -> float:
-    """Distance from a place (2,) to the nearest obstacle, 0 inside one; infinite without any."""
+    """Distance from a position (2,) to the nearest obstacle, 0 inside one; infinite without obstacles."""
     return min((float(distance_to(box, place)[0]) for box in obstacles), default=np.inf)

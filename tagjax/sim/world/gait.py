@@ -1,7 +1,7 @@
-"""Footsteps of a given walk: feet that stand still on the floor, swing in time, and carry the pelvis between them.
+"""Footsteps of a given walk: feet that do not slide while they stand, and the height of the pelvis between them.
 
-The walk is known beforehand, so every footfall is planned: a foot lands where it will be under its hip half way
-through its stance. Stance is 60 % and swing 40 % of a cycle (Perry, Gait Analysis, 1992).
+The walk is known beforehand, so every footfall is planned: a foot lands where it will be under its hip halfway through
+its stance. Stance is 60 % and swing 40 % of a cycle (Perry, Gait Analysis, 1992).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from .bodies import STEP_S
 from .trajectory import smooth_step
 from .walks import Walk
 
-_SWING_FRACTION = 0.8  # of the time between two footfalls; the rest is double support
+_SWING_FRACTION = 0.8  # of the time between two footfalls; both feet stand in the remaining time
 
 
 @dataclasses.dataclass(frozen=True)
 class FootPlan:
-    """One foot over time: ankle (steps, 3), heading and pitch (steps,) (toes down positive), and where it stands."""
+    """One foot over time: ankle (steps, 3), heading and pitch (steps,; toes down positive), and when it stands."""
 
     ankle_m: np.ndarray
     heading_rad: np.ndarray
@@ -38,7 +38,7 @@ class FootSize:
 
 
 def step_time_s(speed_m_s: float) -> float:
-    """Time between footfalls: 1.3 steps a second at 0.5 m/s and 2.1 at 1.4 m/s, as adults walk briskly."""
+    """Time between footfalls: 1.3 steps per second at 0.5 m/s and 2.1 at 1.4 m/s, as of adults at a brisk walk."""
     return 1.0 / float(np.clip(0.9 + 0.85 * speed_m_s, 1.25, 3.2))
 
 
@@ -73,7 +73,7 @@ def plan_feet(walk: Walk, size: FootSize) -> tuple[FootPlan, FootPlan]:
 
 
 def _neutral(walk: Walk, aside_m: float) -> np.ndarray:
-    """Where a foot belongs while one stands: under its hip (steps, 2)."""
+    """Position of a foot while standing: under its hip, (steps, 2)."""
     left = np.stack([-np.sin(walk.heading_rad), np.cos(walk.heading_rad)], axis=-1)
     return walk.position_m + aside_m * left
 
@@ -84,7 +84,7 @@ def _foot_motion(start, plants, steps: int, size: FootSize) -> FootPlan:
     lift, pitch = np.zeros(steps), np.zeros(steps)
     contact = np.ones(steps, bool)
     place[:], heading[:] = start[0], start[1]
-    # Positive pitch turns about the ball (heel up), negative about the heel (toes up).
+    # Positive pitch rotates about the ball (heel up), negative pitch about the heel (toes up).
     previous = start
     for number, (off, land, target, facing) in enumerate(plants):
         length = float(np.linalg.norm(target - previous[0]))
@@ -99,7 +99,7 @@ def _foot_motion(start, plants, steps: int, size: FootSize) -> FootPlan:
         pitch[swing] = up + smooth_step(fraction) * (down - up)
         place[land:], heading[land:] = target, facing
         contact[swing] = False
-        # The heel rises in the second half of the stance before, and the sole comes down after the landing.
+        # The heel rises in the second half of the previous stance, and the sole comes down after the landing.
         begun = plants[number - 1][1] if number else 0
         rise = np.arange(max(begun, off - (land - off)), min(off, steps))
         if len(rise):
@@ -113,10 +113,10 @@ def _foot_motion(start, plants, steps: int, size: FootSize) -> FootPlan:
 
 
 def _ankle(place: np.ndarray, heading: np.ndarray, pitch: np.ndarray, size: FootSize) -> np.ndarray:
-    """Ankle (steps, 3) of a foot that is pitched about its ball (up) or heel (down), both on the floor."""
+    """Ankle (steps, 3) of a foot that is pitched about its ball (heel up) or its heel (toes up), both on the floor."""
     pivot = np.where(pitch >= 0, size.ball_m, -size.heel_m)
     c, s = np.cos(pitch), np.sin(pitch)
-    # The ankle from the pivot, (-pivot, ankle height), turned: toes down carries it forward and up.
+    # The vector from pivot to ankle, (-pivot, ankle height), rotated: toes down moves the ankle forward and up.
     forward = pivot + c * -pivot + s * size.ankle_m
     up = s * pivot + c * size.ankle_m
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
@@ -126,12 +126,12 @@ def _ankle(place: np.ndarray, heading: np.ndarray, pitch: np.ndarray, size: Foot
 def pelvis_height(
     hips_m: tuple[np.ndarray, np.ndarray], ankles_m: tuple[np.ndarray, np.ndarray], leg_m: float, standing_m: float
 ) -> np.ndarray:
-    """Height (steps,) of the hip joints, at most `standing_m`, at which legs reach ankles; smooth."""
+    """Smooth height (steps,) of the hip joints, at most `standing_m`, at which both legs reach the ankles."""
     height = np.full(len(hips_m[0]), standing_m)
     for hip, ankle in zip(hips_m, ankles_m, strict=True):
         across = np.linalg.norm(hip[:, :2] - ankle[:, :2], axis=-1)
         height = np.minimum(height, ankle[:, 2] + np.sqrt(np.maximum((0.997 * leg_m) ** 2 - across**2, 0.2 * leg_m**2)))
-    # In a sharp turn the feet are far apart for a moment: then one lifts off rather than that the person crouches.
+    # In a sharp turn the feet are far apart for a moment: then one lifts off, and the person does not crouch.
     height = np.maximum(height, 0.86 * standing_m)
     half = round(0.05 / STEP_S)
     padded = np.pad(height, 2 * half, mode="edge")

@@ -1,6 +1,6 @@
-"""Objects of the papers' kinds that people carry: boxes, bottles, toys, notebooks, bags; each with a place for its tag.
+"""Objects that people carry, of the kinds in the papers: boxes, bottles, toys, notebooks, bags. Each has a tag position.
 
-Frame: origin at the middle of the bounding box, z up as the object stands, x its front.
+Frame: origin at the centre of the bounding box, z up as the object stands, x its front.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from .bodies import Material, Shape, ShapeKind, rotation_matrix
 
 TAG_GAP_M = 0.002
-"""Of a tag's middle above the surface it sticks to: a label on its foam, and out of the shape for ray casts."""
+"""Distance of a tag's centre from the surface it sticks to: a label with foam, outside the shape for ray casts."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectModel:
-    """An object: its shapes, extent, and where it is held and tagged, all in its own frame."""
+    """An object: shapes, extent, grip and tag position, all in its own frame."""
 
     name: str
     shapes: tuple[Shape, ...]
@@ -30,7 +30,7 @@ class ObjectModel:
 
 @dataclasses.dataclass
 class _Draft:
-    """What a maker returns, in a frame of its choice."""
+    """The result of a maker function, in any frame."""
 
     shapes: list[Shape]
     grip: tuple[float, float, float]
@@ -41,14 +41,14 @@ class _Draft:
 def make_object(kind: str, rng: np.random.Generator, *, look: int | None = None, scale: float = 1.0) -> ObjectModel:
     """Draw an object of a kind of `OBJECT_KINDS`.
 
-    `look` alone decides size and appearance: two objects of one kind, look and scale are exact look-alikes. Without it
-    one is drawn from `rng`, which takes one number in either case. `scale` multiplies every length. Raises `ValueError`
+    `look` alone determines size and appearance: two objects of one kind, look and scale are identical. Without it a
+    look is drawn from `rng`; one number is drawn from `rng` in either case. `scale` multiplies every length. Raises `ValueError`
     for an unknown kind or a scale that is not positive.
     """
     if kind not in _MAKERS:
-        raise ValueError(f"Unknown kind of object {kind!r}; known are {', '.join(OBJECT_KINDS)}.")
+        raise ValueError(f"kind is {kind!r}; expected one of {', '.join(OBJECT_KINDS)}.")
     if not scale > 0:
-        raise ValueError(f"Scale {scale}; it must be positive.")
+        raise ValueError(f"scale is {scale}; expected a positive number.")
     drawn = int(rng.integers(0, 2**31))
     source = np.random.default_rng([OBJECT_KINDS.index(kind), drawn if look is None else look])
     draft = _MAKERS[kind](source)
@@ -68,7 +68,7 @@ def make_object(kind: str, rng: np.random.Generator, *, look: int | None = None,
 
 
 def bounds(shapes: list[Shape] | tuple[Shape, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner (3,) of the axis-aligned box round some shapes, in their body's frame."""
+    """Lowest and highest corner (3,) of the axis-aligned bounding box of shapes, in their body's frame."""
     lows, highs = [], []
     for shape in shapes:
         turn = rotation_matrix(np.array(shape.quaternion))
@@ -102,7 +102,7 @@ def _colour(rng: np.random.Generator, low: float = 0.05, high: float = 0.9) -> t
 def _surface(
     rng: np.random.Generator, *, loss_db: float = 1.0, reflection: float = -0.05, fine: float = 1.0
 ) -> Material:
-    """A skin for a dry object: mostly strong textures, some plain, some dark or shiny."""
+    """A surface for a dry object: mostly strong textures, some plain, some dark or shiny."""
     texture = str(rng.choice(["checker", "stripes", "speckle", "noise", "plain"], p=[0.2, 0.2, 0.2, 0.25, 0.15]))
     dark = rng.random() < 0.12
     return Material(
@@ -139,7 +139,7 @@ def _box(rng: np.random.Generator) -> _Draft:
 
 def _bottle(rng: np.random.Generator) -> _Draft:
     r, half = rng.uniform(0.032, 0.045), rng.uniform(0.075, 0.11)
-    # Water: a good mirror; its loss is assumed.
+    # Water reflects well; its loss is assumed.
     liquid = dataclasses.replace(_surface(rng, fine=1.5), transmission_db=float(rng.uniform(6, 10)), reflection=-0.5)
     label, cap = _surface(rng, loss_db=0.5, fine=2.0), _plain(_colour(rng))
     shoulder = _part("ellipsoid", (r, r, 0.8 * r), (0, 0, half), liquid)
@@ -150,7 +150,7 @@ def _bottle(rng: np.random.Generator) -> _Draft:
         _part("cylinder", (0.36 * r, 0.4 * r), (0, 0, half + 0.95 * r), liquid),
         _part("cylinder", (0.42 * r, 0.3 * r), (0, 0, half + 1.5 * r), cap),
     ]
-    # Foam keeps a tag off the water, or it would not answer.
+    # Foam keeps the tag away from the water; without it the tag could not be read.
     return _Draft(shapes, (0.0, 0.0, 0.55 * half), (r + 0.001 + 3 * TAG_GAP_M, 0.0, -0.1 * half))
 
 
@@ -213,7 +213,7 @@ def _train(rng: np.random.Generator) -> _Draft:
 
 
 def _sheets(rng: np.random.Generator, x: float, y: float, z: float) -> _Draft:
-    """A cover round a block of pages; lies upright, the cover's face ahead."""
+    """A cover around a block of pages; stands upright with the front cover ahead."""
     cover, page = _surface(rng, loss_db=1.0), _plain((0.85, 0.84, 0.78), shine=0.0)
     shapes = [_part("box", (x - 0.0015, y, z - 0.004), (0, 0.003, 0), page)]
     shapes += [_part("box", (0.0015, y, z), (side * x, 0, 0), cover) for side in (-1, 1)]

@@ -23,12 +23,12 @@ Side = Literal["left", "right"]
 Target = Float[np.ndarray, "steps 3"] | None
 
 BLEND_S = 0.3
-"""Time in which a hand goes over between swinging freely and its target."""
+"""Time of the transition between a freely swinging hand and its target."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Hands:
-    """Where the hands shall be, world, (steps, 3); NaN rows and None swing freely."""
+    """Target positions of the hands, world, (steps, 3). Hands swing freely where rows are NaN, and for None."""
 
     left: Target = None
     right: Target = None
@@ -36,12 +36,12 @@ class Hands:
 
 @dataclasses.dataclass(frozen=True)
 class PersonMotion:
-    """A person's limbs over time, both hands as they really are, and how well the feet stand."""
+    """A person's limbs over time, the real positions of both hands, and how far standing feet slide."""
 
     limbs: dict[str, Poses]
     left_hand: Poses
     right_hand: Poses
-    slip_m_s: float  # mean speed over the floor of feet in contact
+    slip_m_s: float  # mean speed of standing feet over the floor
     shoulder_m: dict[str, np.ndarray]  # by side, (steps, 3)
 
 
@@ -52,7 +52,7 @@ def make_person(rng: np.random.Generator, *, height_m: float | None = None) -> P
     """
     height = float(rng.uniform(1.52, 1.93)) if height_m is None else float(height_m)
     if not 0.9 <= height <= 2.2:
-        raise ValueError(f"A person of {height} m; expected 0.9 to 2.2 m.")
+        raise ValueError(f"height_m is {height}; expected 0.9 to 2.2 m.")
     seeds = rng.integers(0, 2**31, 4)
 
     def cloth(number: int, transmission: float, dark: float) -> Material:
@@ -80,8 +80,8 @@ def make_person(rng: np.random.Generator, *, height_m: float | None = None) -> P
         seed=int(seeds[3]),
         transmission_db=3.0,
     )
-    # Assumed: 15 to 20 dB one way through a trunk. No measurement at 900 MHz was found; bodies that block links of 3 to
-    # 11 GHz fade them by 15 dB and more.
+    # Assumed: 15 to 20 dB one way through a trunk. No measurement at 900 MHz was found; bodies attenuate blocked links
+    # at 3 to 11 GHz by 15 dB and more.
     loss = float(rng.uniform(15.0, 20.0))
     return PersonModel(
         height_m=height,
@@ -99,28 +99,28 @@ def make_person(rng: np.random.Generator, *, height_m: float | None = None) -> P
 def person_bodies(
     model: PersonModel, walk: Walk, hands: Hands | None = None, *, label: int = 0, name: str = "person"
 ) -> tuple[Body, ...]:
-    """The limbs of a person on a walk as bodies of role person, all of one name and label.
+    """The limbs of a person on a walk as bodies of role person, all with the same name and label.
 
-    `walk` is sampled every `STEP_S`; `hands` has targets of the same length. Raises `ValueError` where it has not.
+    `walk` is sampled every `STEP_S`; targets in `hands` have the same length, else `ValueError` is raised.
     """
     return limb_bodies(model, move_person(model, walk, hands), label=label, name=name)
 
 
 def limb_bodies(model: PersonModel, motion: PersonMotion, *, label: int = 0, name: str = "person") -> tuple[Body, ...]:
-    """The limbs of a person whose motion is known already: see `person_bodies`."""
+    """The limbs of a person with a given motion as bodies: see `person_bodies`."""
     shapes = limb_shapes(model)
     return tuple(Body(name, shapes[limb], poses, "person", label) for limb, poses in motion.limbs.items())
 
 
 def badge_m(model: PersonModel) -> tuple[float, float, float]:
-    """Where a badge hangs, in the torso's frame: before the middle of the chest, a centimetre clear of the shirt."""
+    """Position of a badge in the torso's frame: at the centre of the chest, one centimetre in front of the shirt."""
     chest = limb_shapes(model)["torso"][1]
     x, y, z = chest.position_m
     return x + chest.size_m[0] + 0.01, y, z
 
 
 def hand_path(model: PersonModel, walk: Walk, hands: Hands | None = None, side: Side = "right") -> Poses:
-    """Where a hand's grip really is, after blending and clamping, and how it is turned.
+    """Real pose of a hand's grip, after blending and clamping.
 
     Frame: z from the grip towards the elbow (up while the arm hangs), x the thumb's side (ahead while it hangs).
     """
@@ -131,7 +131,7 @@ def hand_path(model: PersonModel, walk: Walk, hands: Hands | None = None, side: 
 def hand_target(
     walk: Walk, offset_m: tuple[float, float, float], from_s: float = 0.0, to_s: float = np.inf
 ) -> Float[np.ndarray, "steps 3"]:
-    """Hand target at a fixed place of the body frame (x ahead, y left, z above the floor); NaN outside the times."""
+    """Hand target at a fixed position in the body frame (x ahead, y left, z above the floor); NaN outside the times."""
     c, s = np.cos(walk.heading_rad), np.sin(walk.heading_rad)
     x, y, z = offset_m
     ground = walk.position_m + np.stack([c * x - s * y, s * x + c * y], axis=-1)
@@ -144,14 +144,14 @@ def hand_target(
 def carried_poses(
     hand: Poses, grip_m: tuple[float, float, float], style: Literal["upright", "fist", "hand"] = "upright"
 ) -> Poses:
-    """Poses of an object that a hand holds at `grip_m` (the object's frame).
+    """Poses of an object that a hand holds at `grip_m` (object frame).
 
-    `upright`: its z stays vertical and it turns with the hand about the vertical, as a bag or a full mug; `fist`: its z
-    is the thumb's side, as a stick or bottle held by the middle; `hand`: it has the hand's frame.
+    `upright`: z stays vertical and the object rotates with the hand about the vertical, as a bag or a full mug does;
+    `fist`: z points to the thumb's side, as of a stick or bottle held at its middle; `hand`: the hand's frame.
     """
     turn = rotation_matrix(hand.quaternion)
     if style == "upright":
-        # The thumb's side leans over as the arm lifts: then the way across the palm still tells the heading.
+        # The thumb's side tilts as the arm lifts; the direction across the palm still gives the heading.
         across = turn[..., :, 1] * np.array([1.0, 1.0, 0.0])
         ahead = np.cross(unit(across), np.broadcast_to([0.0, 0.0, 1.0], across.shape))
         turn = frame(np.broadcast_to([0.0, 0.0, 1.0], ahead.shape), ahead)
@@ -161,12 +161,12 @@ def carried_poses(
 
 
 def move_person(model: PersonModel, walk: Walk, hands: Hands | None = None) -> PersonMotion:
-    """Everything that moves: see `PersonMotion`. The limbs of `_figure.LIMBS`, in that order."""
+    """The motion of all limbs along a walk, with the hands at their targets where these are in reach."""
     hands = hands or Hands()
     steps = len(walk.heading_rad)
     for target in (hands.left, hands.right):
         if target is not None and len(target) != steps:
-            raise ValueError(f"A hand's target has {len(target)} steps; the walk has {steps}.")
+            raise ValueError(f"A hand's target has {len(target)} steps; expected {steps}, as the walk has.")
     m = model.measures
     foot = FootSize(m.ankle, m.ball, m.heel, m.hip)
     plans = plan_feet(walk, foot)
@@ -181,7 +181,7 @@ def move_person(model: PersonModel, walk: Walk, hands: Hands | None = None) -> P
     flat = [place(yaw, ground, (0.0, side * m.hip, 0.0)) for side in (1, -1)]
     height = pelvis_height((flat[0], flat[1]), (plans[0].ankle_m, plans[1].ankle_m), m.thigh + m.shin, m.hip_height)
     pelvis = ground + height[:, None] * np.array([0.0, 0.0, 1.0])
-    # How far each foot is ahead of the hips, in leg lengths: arms and pelvis follow it.
+    # How far each foot is ahead of the hips, in leg lengths: it drives arms and pelvis.
     ahead = rotation_matrix(yaw)[..., :, 0]
     reach = [np.sum((plan.ankle_m - pelvis) * ahead, axis=-1) / (m.thigh + m.shin) for plan in plans]
     stride = _smooth(reach[1] - reach[0], 0.05)  # right ahead positive
@@ -216,7 +216,7 @@ def move_person(model: PersonModel, walk: Walk, hands: Hands | None = None) -> P
         free = _free_hand(shoulder, chest_turn, 0.75 * (reach[1 - number] - 0.1), sign, m.upper_arm, m.forearm)
         target = hands.left if side == "left" else hands.right
         if target is not None:
-            # Before the blend too: a hand must not race after a place that it will never reach.
+            # Clamped before the blend too: a hand must not move fast towards a target out of reach.
             target = _clamped(shoulder, target, m.upper_arm, m.forearm)
         wanted = _blended(free, target, walk.position_m, heading)
         wanted = _clamped(shoulder, wanted, m.upper_arm, m.forearm)
@@ -232,14 +232,14 @@ def move_person(model: PersonModel, walk: Walk, hands: Hands | None = None) -> P
 
 
 def _smooth(values: np.ndarray, sigma_s: float) -> np.ndarray:
-    """Gaussian average over time, edges held."""
+    """Gaussian average over time; the first and last value continue beyond the ends."""
     half = min(int(3 * sigma_s / STEP_S), 60)
     weight = np.exp(-0.5 * (np.arange(-half, half + 1) * STEP_S / sigma_s) ** 2)
     return np.convolve(np.pad(values, half, mode="edge"), weight / weight.sum(), mode="valid")
 
 
 def _thumb(elbow: np.ndarray, grip: np.ndarray, chest: np.ndarray) -> np.ndarray:
-    """The thumb's side: ahead of a hanging forearm, up on a level one, without a jump between."""
+    """Direction of the thumb: ahead for a hanging forearm, up for a level one, continuous in between."""
     turn = rotation_matrix(chest)
     level = np.sum(unit(grip - elbow) * turn[..., :, 0], axis=-1, keepdims=True)
     return turn[..., :, 0] * (1.0 - np.clip(level, 0.0, 1.0)) + turn[..., :, 2] * (0.25 + np.clip(level, 0.0, 1.0))
@@ -248,7 +248,7 @@ def _thumb(elbow: np.ndarray, grip: np.ndarray, chest: np.ndarray) -> np.ndarray
 def _free_hand(
     shoulder: np.ndarray, chest: np.ndarray, swing_rad: np.ndarray, sign: float, upper_m: float, lower_m: float
 ) -> np.ndarray:
-    """Grip of an arm that swings by an angle (steps,), forward positive, its elbow bent more when forward."""
+    """Grip of an arm that swings by an angle (steps,), forward positive; the elbow bends more when forward."""
     bend = 0.25 + 0.5 * np.clip(swing_rad, -0.2, 1.0)
     splay = np.full_like(swing_rad, sign * 0.12)
     upper = np.stack([np.sin(swing_rad), splay, -np.cos(swing_rad)], axis=-1)
@@ -257,9 +257,9 @@ def _free_hand(
 
 
 def _blended(free: np.ndarray, target: np.ndarray | None, ground: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """The target where there is one, the free swing far from it, and a smooth way between within `BLEND_S`.
+    """The target where it is known, the free swing elsewhere, and a smooth transition of `BLEND_S` between the two.
 
-    Targets are carried on into their gaps in the body's frame, so that a hand is not left behind.
+    Gaps between targets are filled by interpolation in the body's frame, so that the hand moves with the body.
     """
     if target is None:
         return free
@@ -293,7 +293,7 @@ def _clamped(shoulder: np.ndarray, target: np.ndarray, upper_m: float, lower_m: 
 
 
 def _slip(ankle: np.ndarray, quaternion: np.ndarray, plan: FootPlan, size: FootSize) -> float:
-    """Mean speed of the sole's pivot over the floor while it stands, m/s."""
+    """Mean speed of the sole's pivot over the floor while the foot stands, m/s."""
     pivot = np.where(plan.pitch_rad >= 0, size.ball_m, -size.heel_m)
     local = np.stack([pivot, np.zeros_like(pivot), np.full_like(pivot, -size.ankle_m)], axis=-1)
     sole = ankle + np.einsum("nij,nj->ni", rotation_matrix(quaternion), local)

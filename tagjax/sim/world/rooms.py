@@ -1,6 +1,6 @@
-"""Rooms to put people and objects into: meeting room, room with a door, crowded office, ceiling view, shop.
+"""Rooms for people and objects: meeting room, room with a door, hall, crowded office, ceiling view, shop.
 
-World frame: x away from the camera's wall (0 to the length), y to the left (centred), z up. Every draw differs.
+World frame: x away from the camera's wall (0 to the length), y to the left (centred), z up. Every room is drawn at random.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ Point = tuple[float, float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """A furnished room without people: what stands in it, where one can walk, and where camera and antennas may be."""
+    """A furnished room without people: its bodies, the walk area, and the positions of camera and antennas."""
 
     name: str
     bodies: tuple[Body, ...]
     size_m: Point  # length (x), width (y), height
-    walk_area_m: Rectangle  # of walkers' centres
+    walk_area_m: Rectangle  # for walkers' centres
     obstacles_m: tuple[Rectangle, ...]  # furniture on the floor
-    tables: tuple[Table, ...]  # where things can stand
+    tables: tuple[Table, ...]  # surfaces for objects
     lights: tuple[Light, ...]
     camera_position_m: Point
     camera_look_at_m: Point
@@ -47,27 +47,27 @@ class Room:
     panels: tuple[Panel, ...]  # walls, floor, ceiling and metal, for the radio
     door: Door | None = None
     ambient: float = 0.35
-    antenna_axes: tuple[Point, ...] | None = None  # where each looks, unit vectors; at camera_look_at_m if None
+    antenna_axes: tuple[Point, ...] | None = None  # boresight of each, unit vectors; towards camera_look_at_m if None
 
     def free_place(self, rng: np.random.Generator, radius_m: float = 0.35) -> tuple[float, float]:
-        """A random place of the walk area, `radius_m` from all furniture; `ValueError` if none is found."""
+        """A random position in the walk area, `radius_m` from all furniture; `ValueError` if none is found."""
         x0, y0, x1, y1 = self.walk_area_m
         for _ in range(5000):
             place = np.array([rng.uniform(x0, x1), rng.uniform(y0, y1)])
             if distance_to_nearest(self.obstacles_m, place) >= radius_m:
                 return float(place[0]), float(place[1])
-        raise ValueError(f"No free place of radius {radius_m} m in the {self.name}; ask for a smaller one.")
+        raise ValueError(f"No free position with {radius_m} m around it in the {self.name}; ask for a smaller radius.")
 
 
 def make_room(name: str, rng: np.random.Generator) -> Room:
-    """Draw a room of a name of `ROOMS`. Raises `ValueError` for another name."""
+    """Draw a room of a kind of `ROOMS`. Raises `ValueError` for an unknown kind."""
     if name not in ROOMS:
-        raise ValueError(f"Unknown room {name!r}; known are {', '.join(ROOMS)}.")
+        raise ValueError(f"room is {name!r}; expected one of {', '.join(ROOMS)}.")
     return ROOMS[name](rng)
 
 
 def meeting_room(rng: np.random.Generator) -> Room:
-    """About 6 x 5 m: a table and chairs at the far wall, a low cabinet, free floor, a screen to leave behind."""
+    """About 6 x 5 m: a table and chairs at the far wall, a low cabinet, free floor, a partition that people can go behind."""
     size = _size(rng, (5.6, 6.4), (4.8, 5.6), (2.6, 3.0))
     length, width, _ = size
     plan = Plan()
@@ -100,7 +100,7 @@ def entrance(rng: np.random.Generator) -> Room:
     side = -1 if rng.random() < 0.5 else 1
     y = side * rng.uniform(0.3, 0.9)
     doorway(plan, rng, size, length, y)
-    # The table stands on the other side, out of the way from the door.
+    # The table stands on the other side, not in the way from the door.
     broad, wide = rng.uniform(0.7, 0.9), rng.uniform(1.2, 1.6)
     low, high = sorted((-side * (width / 2 - 0.1), -side * (width / 2 - 0.1 - broad)))
     x = rng.uniform(2.4, 2.9)
@@ -114,7 +114,7 @@ def entrance(rng: np.random.Generator) -> Room:
         low, high = sorted((side * (width / 2 - 0.4), side * width / 2))
         cabinet(plan, rng, (x, low, x + rng.uniform(0.7, 1.1), high), rng.uniform(0.7, 1.1), (0.0, -float(side)))
     area = (1.4, -width / 2 + 0.45, length - 0.45, width / 2 - 0.45)
-    # Behind the wall on the side of the room's axis: a camera on the axis looks past it.
+    # Behind the wall on the side of the room's axis, where a camera on the axis cannot see.
     places = tuple((length + 0.1 + deep / 2, y - side * away) for away in (1.2, 1.95))
     room = _room("room with a door", plan, rng, size, area, Door((length + 0.05, y), places))
     lights = tuple(
@@ -157,7 +157,7 @@ def hall(rng: np.random.Generator) -> Room:
 
 
 def office(rng: np.random.Generator) -> Room:
-    """About 8 x 6 m and crowded: desks with chairs, cubicle walls, metal cabinets, an aisle round and between."""
+    """About 8 x 6 m and crowded: desks with chairs, cubicle walls, metal cabinets, aisles around and between them."""
     size = _size(rng, (7.4, 8.4), (5.8, 6.6), (2.6, 3.0))
     length, width, _ = size
     plan = Plan()
@@ -167,7 +167,7 @@ def office(rng: np.random.Generator) -> Room:
     door = _screen(plan, rng, size, side)
     cloth = surface(rng, 0.1, 0.6, scale=20.0)
     partition = surface(rng, 0.2, 0.7, scale=12.0, contrast=0.3, transmission_db=3.0)
-    # Desks along both sides, each behind a cubicle wall, chairs towards the aisle.
+    # Desks along both sides, separated by cubicle walls, with chairs towards the aisle.
     for row in (-1, 1):
         x = rng.uniform(1.7, 2.1)
         end = length - (1.6 if row == side else 0.4)
@@ -183,7 +183,7 @@ def office(rng: np.random.Generator) -> Room:
             tall = rng.uniform(1.1, 1.5)
             plan.block("cubicle wall", (x + wide + 0.05, low, 0), (x + wide + 0.09, high, tall), partition, "furniture")
             x += wide + 0.14
-    # An island in the aisle leaves more than a walker's width on either side.
+    # A table in the aisle leaves more than a walker's width on either side.
     x = rng.uniform(3.6, 4.4)
     if rng.random() < 0.7:
         table(plan, rng, (x, -0.35, x + rng.uniform(0.8, 1.2), 0.35))
@@ -216,7 +216,7 @@ def ceiling_view(rng: np.random.Generator) -> Room:
         tables=tuple(plan.tables),
         lights=lights,
         camera_position_m=up,
-        # Not straight down: with a millimetre's lean the picture's up is the room's x.
+        # One millimetre off straight down, so that the picture's up direction is the room's x.
         camera_look_at_m=(middle + 0.001, 0.0, top_z),
         antennas_m=((middle, 0.12, up[2]),),
         panels=tuple(plan.panels),
@@ -225,7 +225,7 @@ def ceiling_view(rng: np.random.Generator) -> Room:
 
 
 def shop_floor(rng: np.random.Generator) -> Room:
-    """A shop's exit of 7 x 3 m: shelves along both sides, the camera over the exit, three antennas at the ceiling."""
+    """The exit area of a shop, 7 x 3 m: shelves along both sides, the camera over the exit, three ceiling antennas."""
     size = (7.0, 3.0, float(rng.uniform(2.7, 3.1)))
     length, width, height = size
     plan = Plan()
@@ -256,7 +256,7 @@ def _size(rng: np.random.Generator, *limits: tuple[float, float]) -> Point:
 
 
 def _screen(plan: Plan, rng: np.random.Generator, size: Point, side: int) -> Door:
-    """A wall in a far corner: who goes behind it is out of the camera's sight, yet inside the room, with their tags."""
+    """A partition in a far corner: people behind it are invisible to the camera but still inside the room."""
     length, width, height = size
     x, end = length - 1.15, side * (width / 2 - 1.75)
     low, high = sorted((side * width / 2, end))
@@ -267,7 +267,7 @@ def _screen(plan: Plan, rng: np.random.Generator, size: Point, side: int) -> Doo
 
 
 def _screens_and_things(plan: Plan, rng: np.random.Generator, desk: Table, row: int) -> None:
-    """A monitor and a heap of paper on a desk."""
+    """A monitor and a stack of paper on a desk."""
     x0, y0, x1, y1 = desk.top_m
     x, z = (x0 + x1) / 2 + rng.uniform(-0.2, 0.2), desk.height_m
     back = (y1 if row > 0 else y0) - row * 0.15

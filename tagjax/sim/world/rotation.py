@@ -1,4 +1,7 @@
-"""Unit quaternions w x y z of simulated bodies: from axes, from a turn, products, slow drift of sign removed."""
+"""Unit quaternions w x y z of simulated bodies: from axes and angles, from matrices, products, continuous signs.
+
+Plain NumPy rather than `scipy.spatial.transform.Rotation`: rounding decides bytes of the simulated recordings.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from jaxtyping import Float
 
 
 def multiply(a: Float[np.ndarray, "*#batch 4"], b: Float[np.ndarray, "*#batch 4"]) -> Float[np.ndarray, "*batch 4"]:
-    """Hamilton product: first the turn b, then a."""
+    """Hamilton product: the rotation b followed by the rotation a."""
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
     return np.stack(
@@ -22,16 +25,16 @@ def multiply(a: Float[np.ndarray, "*#batch 4"], b: Float[np.ndarray, "*#batch 4"
 
 
 def turn_about(axis: tuple[float, float, float], angle_rad: np.ndarray | float) -> Float[np.ndarray, "*batch 4"]:
-    """Quaternions of turns by `angle_rad` (any shape) about a unit axis."""
+    """Quaternions of rotations by `angle_rad` (any shape) about a unit axis."""
     half = np.asarray(angle_rad, float) / 2
     return np.concatenate([np.cos(half)[..., None], np.sin(half)[..., None] * np.asarray(axis, float)], axis=-1)
 
 
 def frame(up: Float[np.ndarray, "*batch 3"], ahead: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices whose z axis is `up` and whose x axis is nearest to `ahead`; neither need have unit length."""
+    """Rotation matrices whose z axis is `up` and whose x axis is nearest to `ahead`; neither needs unit length."""
     z = unit(up)
     x = ahead - np.sum(ahead * z, axis=-1, keepdims=True) * z
-    # Where `ahead` lies along `up`, any direction across serves.
+    # Where `ahead` is parallel to `up`, any perpendicular direction will do.
     spare = np.where(np.abs(z[..., :1]) < 0.9, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
     spare = spare - np.sum(spare * z, axis=-1, keepdims=True) * z
     x = unit(np.where(np.linalg.norm(x, axis=-1, keepdims=True) < 1e-9, spare, x))
@@ -90,7 +93,7 @@ def quaternion_of(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, 
 
 
 def continuous(quaternion: Float[np.ndarray, "steps 4"]) -> Float[np.ndarray, "steps 4"]:
-    """The same turns with signs chosen so that neighbouring steps are near each other (q and -q are one turn)."""
+    """The same rotations with signs that keep neighbouring steps close (q and -q are the same rotation)."""
     flips = np.sum(quaternion[1:] * quaternion[:-1], axis=-1) < 0
     sign = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
     return np.concatenate([quaternion[:1], quaternion[1:] * sign[:, None]])

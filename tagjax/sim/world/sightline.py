@@ -1,4 +1,4 @@
-"""Lines of sight between points of a world: what they pass through, in closed form (no ray is cast, nothing posed)."""
+"""Lines of sight between points of a world, and the bodies they pass through, in closed form (without ray casting)."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ _GRAZE_M = 0.001
 
 @dataclasses.dataclass(frozen=True)
 class Sight:
-    """What lines of sight pass through: metres inside each body, and the one-way loss of a radio wave."""
+    """The result for lines of sight: length inside each body, and the one-way loss of a radio wave."""
 
     inside_m: np.ndarray  # (lines, bodies)
     loss_db: np.ndarray  # (lines,) 0 = free, infinite behind metal
 
     @property
     def crossed(self) -> np.ndarray:
-        """Which bodies each line passes through, (lines, bodies); touching one does not count."""
+        """Which bodies each line passes through, (lines, bodies). Touching a body does not count."""
         return self.inside_m > _GRAZE_M
 
 
 def line_of_sight(
     world: World, start_m: np.ndarray, end_m: np.ndarray, steps: np.ndarray, *, exclude: Sequence[int] = ()
 ) -> Sight:
-    """What lies between starts (lines, 3) and ends (lines, 3), metres, each line at its own step (lines,), the nearest.
+    """Bodies between starts (lines, 3) and ends (lines, 3), metres, each line at its own step (lines,), rounded.
 
-    Exact chords of every shape, so a line passes through any number of bodies; `exclude` names bodies that do not
-    count (the tag's own). A body dims by the most lossy of its materials that is crossed, the limbs of a person
-    (bodies of one name) together once, metal wholly.
+    The chords of all shapes are exact, and a line may pass through any number of bodies. Bodies in `exclude` are ignored
+    (the tag's own). The loss of a body is that of the most lossy material crossed; the limbs of a person (bodies of one
+    name) count once together; metal blocks completely.
     """
     start, end = np.broadcast_arrays(np.asarray(start_m, float), np.asarray(end_m, float))
     when = np.rint(np.asarray(steps)).astype(int)
@@ -59,7 +59,7 @@ def line_of_sight(
 def is_free(
     world: World, start_m: np.ndarray, end_m: np.ndarray, steps: np.ndarray, *, exclude: Sequence[int] = ()
 ) -> np.ndarray:
-    """Whether nothing lies between starts and ends, (lines,): `~line_of_sight(...).crossed.any(axis=1)`, but sooner."""
+    """Whether nothing lies between starts and ends, (lines,): a faster `~line_of_sight(...).crossed.any(axis=1)`."""
     start, end, when = np.asarray(start_m, float), np.asarray(end_m, float), np.rint(np.asarray(steps)).astype(int)
     free = np.ones(len(when), bool)
     for number, body in enumerate(world.bodies):
@@ -75,7 +75,7 @@ def is_free(
 def _near(
     body: Body, start: np.ndarray, end: np.ndarray, when: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which lines come near a body at their steps, and their starts and ends in its frame."""
+    """Lines that come near a body at their steps, and their starts and ends in the body's frame."""
     index = np.clip(when, 0, len(body.poses.position_m) - 1)
     place = body.poses.position_m[index]
     low, high = bounds(body.shapes)
@@ -102,7 +102,7 @@ def chord_m(shape: Shape, start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
         within = _slab(start[:, 2:], ray[:, 2:], size[1:2])
         enter, leave = np.maximum(around[0], within[0]), np.minimum(around[1], within[1])
         if shape.kind == "capsule":
-            # Convex: the union's span is that of its three parts' spans.
+            # A capsule is convex: its span is the union of the spans of its three parts.
             enter, leave = np.where(enter < leave, enter, np.inf), np.where(enter < leave, leave, -np.inf)
             for side in (-1.0, 1.0):
                 one, two = _ball((start - [0, 0, side * size[1]]) / size[0], ray / size[0])
@@ -112,7 +112,7 @@ def chord_m(shape: Shape, start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
 
 
 def _distance(start: np.ndarray, end: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Of points (lines, 3) from segments, (lines,)."""
+    """Distance (lines,) of points (lines, 3) from segments."""
     ray, away = end - start, point - start
     fraction = np.sum(ray * away, axis=-1) / np.maximum(np.sum(ray * ray, axis=-1), 1e-18)
     return np.linalg.norm(away - np.clip(fraction, 0, 1)[:, None] * ray, axis=-1)

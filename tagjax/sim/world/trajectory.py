@@ -1,6 +1,6 @@
-"""Smooth paths in space with bounded acceleration: through points, waves of a hand, rests; sampled every `STEP_S`.
+"""Smooth paths in space with bounded acceleration: through points, waving hands, pauses. Sampled every `STEP_S`.
 
-Second differences of a sampled path are averages of its acceleration, so a bound on the motion is one on the samples.
+Second differences of a sampled path are averages of its acceleration, so a bound on the motion bounds the samples too.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .bodies import STEP_S
 Path = Float[np.ndarray, "_ 3"]
 WaveKind = Literal["line", "circle", "eight", "random"]
 
-_FINE = 200  # geometric samples a leg between two way points
+_FINE = 200  # geometric samples between two way points
 
 
 def max_speed(path_m: Float[np.ndarray, "steps dims"], step_s: float = STEP_S) -> float:
@@ -31,7 +31,7 @@ def max_acceleration(path_m: Float[np.ndarray, "steps dims"], step_s: float = ST
 
 
 def num_steps(duration_s: float) -> int:
-    """Samples of a motion of that duration, both ends counted."""
+    """Number of samples of a motion of that duration, both ends included."""
     return round(duration_s / STEP_S) + 1
 
 
@@ -42,27 +42,29 @@ def smooth_step(fraction: np.ndarray) -> np.ndarray:
 
 
 def stay_at(point_m: Sequence | np.ndarray, duration_s: float) -> Path:
-    """Stay at a point."""
+    """A path that stays at a point."""
     return np.repeat(np.asarray(point_m, float)[None], num_steps(duration_s), axis=0)
 
 
 def join(*paths_m: Path) -> Path:
-    """One path after the other; each must start where the one before ends (the shared sample is kept once).
+    """Concatenate paths. Each must start where the previous one ends; that sample is kept once.
 
-    Raises `ValueError` where the ends are more than 1 mm apart. Both should be at rest there, or the joint has a jerk:
-    `max_acceleration` tells.
+    Raises `ValueError` where the ends are more than 1 mm apart. The speed should be zero there, or the acceleration
+    is unbounded: check it with `max_acceleration`.
     """
     parts = [paths_m[0]]
     for number, path in enumerate(paths_m[1:], 1):
         gap = float(np.linalg.norm(path[0] - parts[-1][-1]))
         if gap > 1e-3:
-            raise ValueError(f"Path {number} starts {gap:.3f} m from the end of the one before it; make them meet.")
+            raise ValueError(
+                f"Path {number} starts {gap:.3f} m from the end of the previous one; expected at most 0.001 m."
+            )
         parts.append(path[1:])
     return np.concatenate(parts)
 
 
 def wait_then_move(path_m: Path, wait_s: float, duration_s: float | None = None) -> Path:
-    """Rest at the start of `path_m` for `wait_s`, follow it, and rest at its end up to `duration_s`, if given.
+    """Stay at the start of `path_m` for `wait_s`, follow the path, and stay at its end until `duration_s`, if given.
 
     Raises `ValueError` if the path does not fit into `duration_s`.
     """
@@ -72,14 +74,14 @@ def wait_then_move(path_m: Path, wait_s: float, duration_s: float | None = None)
     left = num_steps(duration_s) - len(moved)
     if left < 0:
         raise ValueError(
-            f"Rest and path take {(len(moved) - 1) * STEP_S:.2f} s, more than the {duration_s} s asked for: "
-            "shorten the rest or the path, or move faster."
+            f"Wait and path take {(len(moved) - 1) * STEP_S:.2f} s; expected at most duration_s, {duration_s} s. "
+            "Shorten the wait or the path, or move faster."
         )
     return np.concatenate([moved, np.repeat(moved[-1:], left, axis=0)])
 
 
 def blend(first_m: Path, second_m: Path, start_s: float, duration_s: float = 0.5) -> Path:
-    """Go over from one path to another of equal length between `start_s` and `start_s + duration_s`, smoothly."""
+    """Blend smoothly from one path into another of equal length, from `start_s` to `start_s + duration_s`."""
     time_s = np.arange(len(first_m)) * STEP_S
     fraction = smooth_step((time_s - start_s) / max(duration_s, STEP_S))[:, None]
     return first_m * (1 - fraction) + second_m * fraction
@@ -92,12 +94,12 @@ def path_through(
     times_s: Sequence | np.ndarray | None = None,
     max_acceleration_m_s2: float = 3.0,
 ) -> Path:
-    """A smooth curve through points (num_points, 3), from rest to rest.
+    """A smooth curve through points (num_points, 3), with zero speed at both ends.
 
-    With `speed_m_s`: as fast as the acceleration bound allows, never above that speed, which long straight legs reach
-    (bends are taken slower). With `times_s` (num_points,), from 0 on: at each point at its time. Give one of the two.
+    With `speed_m_s`: as fast as the acceleration bound allows, never above that speed. Long straight parts reach it,
+    bends are slower. With `times_s` (num_points,), from 0 on: passes each point at its time. Give one of the two.
 
-    Raises `ValueError` for fewer than two points, points that repeat, or times that need more acceleration.
+    Raises `ValueError` for fewer than two points, repeated points, or times that need more acceleration.
     """
     points = np.asarray(points_m, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.all(np.isfinite(points)):
@@ -111,7 +113,7 @@ def path_through(
         raise ValueError(f"Speed {speed_m_s} m/s and acceleration {max_acceleration_m_s2} m/s^2 must be positive.")
     chord = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     if chord.min() < 1e-6:
-        raise ValueError("Two way points in a row are the same; use `stay_at` and `join` for stops.")
+        raise ValueError("Two consecutive way points are the same; use `stay_at` and `join` for stops.")
     knots = np.concatenate([[0.0], np.cumsum(chord)])
     curve = CubicSpline(knots, points, bc_type="natural")
     place = curve(np.interp(np.linspace(0, len(chord), _FINE * len(chord) + 1), np.arange(len(knots)), knots))
@@ -121,15 +123,15 @@ def path_through(
     push = 1.0
     while True:
         path = _run_along(curve, length, speed_m_s, push * max_acceleration_m_s2)
-        # A hairpin narrower than the fine samples passes a little above its bound: hold back a little more.
+        # A bend narrower than the fine samples exceeds the bound a little: lower the bound.
         if max_acceleration(path) <= max_acceleration_m_s2 or push < 0.05:
             return path
         push *= 0.85
 
 
 def _run_along(curve: CubicSpline, length: np.ndarray, speed: float, acceleration: float) -> np.ndarray:
-    """Samples of the fastest run from rest to rest along a curve by arc length, within the bounds."""
-    # 0.6 sideways and 0.75 along stay below 1 together (0.96): room for the curve being sampled.
+    """Samples of the fastest motion along a curve (by arc length) within the bounds, with zero speed at both ends."""
+    # 0.6 sideways and 0.75 along combine to 0.96: the margin covers the sampling of the curve.
     sideways, along = 0.6 * acceleration, 0.75 * acceleration
     ds = np.diff(length)
     square = np.minimum(speed**2, sideways / np.maximum(np.linalg.norm(curve(length, 2), axis=-1), 1e-9))
@@ -141,7 +143,7 @@ def _run_along(curve: CubicSpline, length: np.ndarray, speed: float, acceleratio
     pace = np.sqrt(square)
     time = np.concatenate([[0.0], np.cumsum(2 * ds / np.maximum(pace[1:] + pace[:-1], 1e-9))])
     sample = np.arange(int(np.ceil(time[-1] / STEP_S)) + 1) * STEP_S
-    # Between two fine points the acceleration along the curve is constant: place them exactly, not linearly in time.
+    # Between two fine points the acceleration along the curve is constant: exact positions, not linear in time.
     leg = np.clip(np.searchsorted(time, sample, side="right") - 1, 0, len(ds) - 1)
     into = np.clip(sample - time[leg], 0.0, np.diff(time)[leg])
     push = (square[1:] - square[:-1])[leg] / (2 * ds[leg])
@@ -151,7 +153,7 @@ def _run_along(curve: CubicSpline, length: np.ndarray, speed: float, acceleratio
 def _timed(points: np.ndarray, times: np.ndarray, acceleration: float) -> np.ndarray:
     if times.shape != (len(points),) or times[0] != 0 or np.any(np.diff(times) <= 0):
         raise ValueError(f"times_s must be {len(points)} increasing times from 0; found {times}.")
-    # A quintic between two points; a cubic spline with ends at rest through more.
+    # A quintic between two points; a cubic spline with zero end speeds through more.
     if len(points) == 2:
         fraction = smooth_step(np.arange(num_steps(times[-1])) * STEP_S / times[-1])[:, None]
         path = points[0] * (1 - fraction) + points[1] * fraction
@@ -161,7 +163,7 @@ def _timed(points: np.ndarray, times: np.ndarray, acceleration: float) -> np.nda
     if found > acceleration * (1 + 1e-6):
         longer = float(np.sqrt(found / acceleration))
         raise ValueError(
-            f"These times need {found:.1f} m/s^2, more than {acceleration} m/s^2; stretch them by {longer:.2f}."
+            f"These times need {found:.1f} m/s^2; expected at most {acceleration} m/s^2. Multiply them by {longer:.2f}."
         )
     return path
 
@@ -178,19 +180,19 @@ def wave(
     across: Sequence | np.ndarray = (0.0, 0.0, 1.0),
     rng: np.random.Generator | None = None,
 ) -> Path:
-    """A hand's motion about a centre, at rest there at both ends, with exactly the asked peak speed.
+    """A hand's motion about a centre, with exactly the given peak speed and zero speed at the centre at both ends.
 
     `line` swings along `direction`; `circle` and `eight` lie in the plane of `direction` and `across`; `random` is a
-    sum of slow sinusoids in all three axes (needs `rng`). Amplitude is the reach from the centre; the smallest that
-    keeps the bound, but at least 0.15 m, if None. Raises `ValueError` if speed, amplitude, duration and acceleration do
-    not go together.
+    sum of slow sinusoids in all three axes (needs `rng`). Amplitude is the largest distance from the centre; None takes
+    the smallest one within the acceleration bound, at least 0.15 m. Raises `ValueError` if speed, amplitude, duration
+    and acceleration are incompatible.
     """
     if peak_speed_m_s <= 0 or duration_s < 0.5:
         raise ValueError(
-            f"A wave needs a positive speed and 0.5 s or more; found {peak_speed_m_s} m/s, {duration_s} s."
+            f"A wave of {peak_speed_m_s} m/s for {duration_s} s; expected a positive speed and at least 0.5 s."
         )
     if kind == "random" and rng is None:
-        raise ValueError("A random wave needs rng.")
+        raise ValueError("A random wave needs a random generator; give rng.")
     steps = num_steps(duration_s)
     shape = _wave_shape(kind, np.asarray(direction, float), np.asarray(across, float), rng)
     reach = amplitude_m or max(0.15, 0.8 * peak_speed_m_s**2 / max_acceleration_m_s2)
@@ -204,15 +206,15 @@ def wave(
             break
         reach *= 1.08
     raise ValueError(
-        f"A {kind} at {peak_speed_m_s} m/s within {reach:.2f} m needs {found:.1f} m/s^2, more than "
-        f"{max_acceleration_m_s2}: slow it down, or give it more room or time."
+        f"A {kind} at {peak_speed_m_s} m/s within {reach:.2f} m needs {found:.1f} m/s^2; expected at most "
+        f"{max_acceleration_m_s2} m/s^2. Lower the speed, or allow more amplitude or time."
     )
 
 
 def _wave_shape(
     kind: WaveKind, direction: np.ndarray, across: np.ndarray, rng: np.random.Generator | None
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Curve of unit reach by phase (rad): phases (steps,) to offsets (steps, 3)."""
+    """Curve of unit amplitude as a function of phase (rad): phases (steps,) to offsets (steps, 3)."""
     along = direction / np.linalg.norm(direction)
     side = across - (across @ along) * along
     side = side / np.linalg.norm(side)
@@ -230,7 +232,7 @@ def _wave_shape(
 
 
 def _wave_of_reach(shape, steps: int, speed: float, reach: float) -> np.ndarray:
-    """The wave with that reach, approximately, and peak speed, exactly."""
+    """The wave with approximately that amplitude and exactly that peak speed."""
     time = np.arange(steps) * STEP_S
     duration = time[-1]
     ramp = min(0.4 * duration, 2.0)
@@ -243,5 +245,5 @@ def _wave_of_reach(shape, steps: int, speed: float, reach: float) -> np.ndarray:
         size = float(np.linalg.norm(path, axis=-1).max())
         if abs(size / reach - 1) < 0.03:
             break
-        rate *= size / reach  # too wide: swing faster
+        rate *= size / reach  # too wide: swing at a higher rate
     return path

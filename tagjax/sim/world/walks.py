@@ -11,12 +11,12 @@ from .crowd import Door, Rectangle, simulate
 from .trajectory import num_steps
 
 MAX_ACCELERATION_M_S2 = 2.0
-"""Of the simulated walks; people start and stop at 1 to 2 m/s^2."""
+"""Acceleration limit of the simulated walks; people start and stop at 1 to 2 m/s^2."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Walk:
-    """A body's place on the floor and heading over time."""
+    """Position on the floor and heading of a walking person over time."""
 
     position_m: np.ndarray  # (num_steps, 2) world x y
     velocity_m_s: np.ndarray  # (num_steps, 2)
@@ -37,15 +37,17 @@ def random_walks(
     num_door: int = 0,
     stop_probability: float = 0.15,
 ) -> tuple[Walk, ...]:
-    """Walks of `num` people in one area, sampled every `STEP_S`: their centres stay `min_distance_m` apart.
+    """Walks of `num` people in one area, sampled every `STEP_S`. Their centres stay `min_distance_m` apart.
 
-    They walk from way point to way point round `obstacles_m`, veer to the right of each other and brake in time. The
-    first `num_door` of them start at the door's outside places, come in, and go out again if crowd and time (20 s or
-    more) let them. Acceleration is at most
-    `MAX_ACCELERATION_M_S2`. Raises `ValueError` where there is no room for all, or the distance could not be kept.
+    They walk between random way points around `obstacles_m`, evade each other to the right and brake in time. The first
+    `num_door` of them start outside the door, come in, and leave again if the crowd and the time (at least 20 s) allow
+    it. Acceleration is at most `MAX_ACCELERATION_M_S2`. Raises `ValueError` where there is not enough room for all, or
+    the distance could not be kept.
     """
     if num_door > num or num_door > (len(door.outside_m) if door else 0):
-        raise ValueError(f"{num_door} of {num} people through a door with {len(door.outside_m) if door else 0} places.")
+        raise ValueError(
+            f"num_door is {num_door}; expected at most {num} people and {len(door.outside_m) if door else 0} places outside."
+        )
     steps = num_steps(duration_s)
     for _ in range(8):
         place, velocity = simulate(
@@ -62,19 +64,19 @@ def random_walks(
             stop_probability,
             MAX_ACCELERATION_M_S2,
         )
-        # Braking is planned, yet a squeeze from several sides can eat the margin: such a draw is thrown away.
+        # Braking is planned, but people on several sides can use up the margin: such a draw is rejected.
         if _nearest(place) >= min_distance_m:
             return tuple(_as_walk(place[:, i], velocity[:, i], rng) for i in range(num))
     raise ValueError(
-        f"{num} walkers could not keep {min_distance_m} m apart in {area_m}: fewer walkers, a smaller distance or less "
-        "furniture."
+        f"{num} walkers could not keep {min_distance_m} m apart in {area_m}; ask for fewer walkers, a smaller distance or "
+        "less furniture."
     )
 
 
 def walk_along(path_m: np.ndarray, heading_rad: float | None = None) -> Walk:
-    """A walk (steps, 2) or (steps, 3: z left out) that follows a given path, such as one of `path_through`.
+    """A walk along a given path (steps, 2) or (steps, 3), of which z is ignored, such as one of `path_through`.
 
-    `heading_rad` is where the walker faces before the first move; along the first move if None.
+    `heading_rad` is the heading before the first motion; None takes the direction of the first motion.
     """
     place = np.asarray(path_m, float)[:, :2]
     velocity = np.gradient(place, STEP_S, axis=0) if len(place) > 1 else np.zeros_like(place)
@@ -89,7 +91,7 @@ def _nearest(place: np.ndarray) -> float:
 
 
 def _as_walk(place: np.ndarray, velocity: np.ndarray, rng: np.random.Generator, start: float | None = None) -> Walk:
-    """Add the heading, which follows the velocity at 4 rad/s or less, and the gait."""
+    """Add the heading, which follows the velocity at 4 rad/s at most, and the gait phase."""
     pace = np.linalg.norm(velocity, axis=-1)
     course = np.arctan2(velocity[:, 1], velocity[:, 0])
     moving = pace > 0.1
@@ -98,7 +100,7 @@ def _as_walk(place: np.ndarray, velocity: np.ndarray, rng: np.random.Generator, 
     now, rate = first if start is None else start, 0.0
     for step in range(len(place)):
         turn = (course[step] - now + np.pi) % (2 * np.pi) - np.pi if moving[step] else 0.0
-        # A turn starts and ends gently: bounded rate, and rate that follows in 0.1 s.
+        # Turns start and end smoothly: the turn rate is bounded and low-pass filtered with 0.1 s.
         rate += (np.clip(5.0 * turn, -4.0, 4.0) - rate) * min(1.0, STEP_S / 0.1)
         now += rate * STEP_S
         heading[step] = now
