@@ -75,14 +75,14 @@ def reference_gain(tag, antenna, carrier, transmission=1.0, dipole=None, boresig
             inside /= 1 + np.exp(-(reach - abs((hit - centre) @ axis)) / channel.EDGE_M)
         length = np.linalg.norm(hit - antenna) + np.linalg.norm(tag - hit)
         total += path(hit - antenna, tag - hit, length, length, reflection * inside)
-    things = jax.tree.map(lambda x: np.asarray(x, complex if np.iscomplexobj(x) else float), environment.scatterers)
+    scatterers = jax.tree.map(lambda x: np.asarray(x, complex if np.iscomplexobj(x) else float), environment.scatterers)
     for place, rcs, reflection, axis, half, radius in zip(
-        things.position_m,
-        things.rcs_m2,
-        things.reflection,
-        things.axis,
-        things.half_length_m,
-        things.radius_m,
+        scatterers.position_m,
+        scatterers.rcs_m2,
+        scatterers.reflection,
+        scatterers.axis,
+        scatterers.half_length_m,
+        scatterers.radius_m,
         strict=True,
     ):
 
@@ -228,8 +228,8 @@ def test_blocked_line_of_sight_leaves_the_reflections():
 
 def test_scatterer_obeys_the_radar_equation_far_and_a_mirror_near():
     def scattered(distance, rcs=1.0):
-        things = point_scatterers(np.array([[0.0, 0.0, distance]]), np.array([rcs]))
-        around = Environment(free_space().planes, things)
+        scatterers = point_scatterers(np.array([[0.0, 0.0, distance]]), np.array([rcs]))
+        around = Environment(free_space().planes, scatterers)
         return abs(complex(link_gain(f32([0.1, 0.0, 0.0]), HERE, CARRIER, around, transmission=BLOCKED)))
 
     np.testing.assert_allclose(scattered(50.0), np.sqrt(1 / (4 * np.pi)) / 50**2, rtol=0.02)
@@ -351,7 +351,7 @@ def test_gaps_between_reads_of_a_tag():
     assert 0.100 < nearly_all < 0.160
 
 
-def test_every_tag_answers_once_a_round_in_changing_order():
+def test_every_tag_replies_once_per_round_in_random_order():
     slots = draw_schedule(0.0, 30.0, 7, np.random.default_rng(0))
     assert np.diff(slots.time_s).min() > 5e-4
     rounds = [slots.tag[slots.round == r] for r in range(1, slots.round.max() - 1)]
@@ -362,7 +362,7 @@ def test_every_tag_answers_once_a_round_in_changing_order():
     np.testing.assert_allclose(np.mean(np.diff(begins)), 17.3e-3 + 7 * 4.23e-3, rtol=0.02)
 
 
-def test_a_tag_out_of_reach_takes_no_slot():
+def test_a_tag_out_of_range_takes_no_slot():
     """Six of seven tags go after 10 s: then the rounds are those of one tag; with none there is only the base."""
     when = np.array([0.0, 10.0, 20.0])
     present = np.ones((3, 7, 1), bool)
@@ -375,8 +375,8 @@ def test_a_tag_out_of_reach_takes_no_slot():
         some = (slots.time_s > low) & (slots.time_s < high)
         found = np.sum(some) / num / (high - low)
         np.testing.assert_allclose(found, 1 / (17.3e-3 + num * 4.23e-3), rtol=0.04)
-    everybody = (np.zeros(1), np.ones((1, 7, 1), bool))
-    one, other = (draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), in_range=w) for w in (None, everybody))
+    all_tags = (np.zeros(1), np.ones((1, 7, 1), bool))
+    one, other = (draw_schedule(0.0, 30.0, 7, np.random.default_rng(0), in_range=w) for w in (None, all_tags))
     np.testing.assert_array_equal(one.time_s, other.time_s)
 
 
@@ -394,7 +394,7 @@ def test_antennas_wait_only_for_tags_that_they_reach():
 
 
 def test_far_tags_leave_the_reader_to_near_ones():
-    """Eleven tags at 30 m are never heard; the one at 1 m is read as if it were alone."""
+    """Eleven tags at 30 m are never read; the one at 1 m is read as if it were alone."""
     near, far = [[0.0, 0.0, 1.0]], [[0.5 * k, 0.0, 30.0] for k in range(11)]
     counts = []
     for positions in (near, near + far):
@@ -406,7 +406,7 @@ def test_far_tags_leave_the_reader_to_near_ones():
 
 @pytest.fixture(scope="module")
 def static_by_rssi():
-    """Still tags in free space, one for each RSSI, on one channel."""
+    """Static tags in free space, one for each RSSI, on one channel."""
     levels = np.array([-46.0, -50, -53, -59, -62, -65, -67])
     distance = 10 ** ((-45.0 - levels) / 40)
     paths = still([[0.0, 0.0, d] for d in distance])
@@ -443,13 +443,13 @@ def test_rssi_level_and_spread(static_by_rssi):
     assert all(np.all(r * 2 == np.rint(r * 2)) for r in rssi)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1])
-def test_pi_flips_come_at_their_share(share):
+@pytest.mark.parametrize("probability", [0.0, 0.1])
+def test_pi_flips_have_their_probability(probability):
     """0.06 to 0.12 of the reads give the 11 to 21 % of transitions that logs show (rfid-facts 1.4)."""
-    settings = dataclasses.replace(PLAIN, flip_probability=share)
+    settings = dataclasses.replace(PLAIN, flip_probability=probability)
     reads = simulate_inventory(still([[0.0, 0.0, 1.0]], 120.0), AT_ORIGIN, free_space(), settings, seed=0).reads
-    assert abs(pi_flip_share(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index) - share) < 0.012
-    assert reads.pi_flips == (share > 0)
+    assert abs(pi_flip_share(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index) - probability) < 0.012
+    assert reads.pi_flips == (probability > 0)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -479,7 +479,7 @@ def test_dwell_and_hop_table():
     assert abs(np.median(dwell) - 0.203) < 0.01
 
 
-def test_antennas_share_the_reads_and_each_read_is_of_its_antenna():
+def test_antennas_take_turns_and_each_read_has_its_antenna():
     """The phase, taken back to distance by the read's own antenna, is constant for each tag and antenna."""
     antennas = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.3, 0.0]])
     time_s = np.linspace(0, 40, 401)
@@ -488,8 +488,8 @@ def test_antennas_share_the_reads_and_each_read_is_of_its_antenna():
     drawn = simulate_inventory(paths, antennas, free_space(), PLAIN, seed=0, reader=quiet_reader())
     reads = drawn.reads
     np.testing.assert_allclose(np.bincount(reads.antenna)[1:] / reads.num_reads, 0.25, atol=0.02)
-    stretch = np.diff(drawn.time_s[1:][np.diff(reads.antenna) != 0])
-    assert 0.03 < np.median(stretch) < 0.24  # rfid-facts 1.8 and 1.9
+    turn_s = np.diff(drawn.time_s[1:][np.diff(reads.antenna) != 0])
+    assert 0.03 < np.median(turn_s) < 0.24  # rfid-facts 1.8 and 1.9
     np.testing.assert_allclose(drawn.range_m, np.linalg.norm(drawn.position_m - antennas[reads.antenna - 1], axis=1))
     np.testing.assert_allclose(drawn.multipath_rad, 0, atol=1e-3)
     for epc in paths:

@@ -183,7 +183,7 @@ def test_light_noise_and_photographs_change_the_pictures_and_not_the_flow(pairs)
     again = jax.device_get(flow_pairs(NOISY, BATCH, photographs, key=jax.random.key(1)))
     for a, b in zip(jax.tree.leaves(noisy), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
-    # No two keys share a picture.
+    # Different keys give different pictures.
     assert len({a.tobytes() for a in noisy.first}) == BATCH
 
 
@@ -235,6 +235,6 @@ def test_motion_is_mostly_small_partly_zero_and_sometimes_large():
         ({"camera_tilt": 0.5}, "camera_tilt.*degenerate"),
     ],
 )
-def test_settings_that_make_no_picture_are_refused(change, words):
+def test_impossible_settings_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
         dataclasses.replace(NOISY, **change)

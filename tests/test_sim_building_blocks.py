@@ -57,17 +57,17 @@ def test_straight_path_is_a_trapezium():
     assert (len(path) - 1) * STEP_S == pytest.approx(5 / 1.25 + 1.25 / 1.5, abs=2 * STEP_S)
 
 
-def test_timed_path_is_at_its_points_in_time_or_says_what_it_needs():
+def test_timed_path_passes_its_points_in_time_or_is_refused():
     points, times = [[0, 0, 1], [0.5, 0.2, 1], [1.0, 0, 1.2]], [0, 1.0, 2.0]
     path = trajectory.path_through(points, times_s=times, max_acceleration_m_s2=4.0)
     np.testing.assert_allclose(path[[0, 100, 200]], points, atol=1e-9)
-    with pytest.raises(ValueError, match="stretch them"):
+    with pytest.raises(ValueError, match="Multiply them"):
         trajectory.path_through(points, times_s=[0, 0.2, 0.4], max_acceleration_m_s2=4.0)
 
 
 @pytest.mark.parametrize("kind", ["line", "circle", "eight", "random"])
 @pytest.mark.parametrize("speed", [0.3, 1.0, 2.5])
-def test_wave_has_the_asked_peak_speed_and_rests_at_both_ends(kind, speed):
+def test_wave_has_the_given_peak_speed_and_zero_speed_at_both_ends(kind, speed):
     path = trajectory.wave(kind, (1, 2, 1), 6.0, peak_speed_m_s=speed, rng=np.random.default_rng(3))
     assert trajectory.max_speed(path) == pytest.approx(speed, rel=1e-9)
     assert trajectory.max_acceleration(path) <= 12.0
@@ -86,7 +86,7 @@ def test_impossible_motions_are_refused():
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.5])
-def test_still_then_move(speed):
+def test_wait_then_move(speed):
     run = trajectory.path_through([[0, 0, 1], [3, 0, 1]], speed_m_s=speed, max_acceleration_m_s2=6.0)
     path = trajectory.wait_then_move(run, 1.5, 10.0)
     assert len(path) == trajectory.num_steps(10.0)
@@ -96,7 +96,7 @@ def test_still_then_move(speed):
 
 
 @pytest.mark.parametrize("name", ["meeting_room", "office", "shop_floor"])
-def test_walkers_keep_apart_and_out_of_furniture(name):
+def test_walkers_keep_their_distance_to_each_other_and_to_furniture(name):
     rng = np.random.default_rng(5)
     room = make_room(name, rng)
     num = 2 if name == "shop_floor" else 3
@@ -124,7 +124,7 @@ def test_walkers_without_room_are_refused():
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.3, 2.0])
-def test_feet_stand_still_and_legs_hold_together(speed):
+def test_standing_feet_do_not_slide_and_legs_stay_connected(speed):
     model = make_person(np.random.default_rng(1))
     walk = straight(speed)
     person = move_person(model, walk)
@@ -137,8 +137,8 @@ def test_feet_stand_still_and_legs_hold_together(speed):
         np.testing.assert_allclose(np.linalg.norm(knee - ankle, axis=-1), m.shin, atol=2e-3)
         assert ankle[:, 2].min() > 0.9 * m.ankle
         assert trajectory.max_speed(ankle) < 5 * speed + 1.0
-        resting = np.linalg.norm(np.diff(ankle, axis=0), axis=-1).min()
-        assert resting < 1e-9
+        slowest = np.linalg.norm(np.diff(ankle, axis=0), axis=-1).min()
+        assert slowest < 1e-9
     hips = person.limbs["hips"].position_m
     np.testing.assert_allclose(hips[:, :2], walk.position_m)
     assert hips[:, 2].min() > 0.8 * m.hip_height
@@ -154,7 +154,7 @@ def test_feet_end_side_by_side_after_a_walk():
         )
 
 
-def test_hand_reaches_what_it_can_and_no_farther():
+def test_hands_reach_targets_within_the_arms_length_only():
     model = make_person(np.random.default_rng(2), height_m=1.75)
     walk = straight(1.0)
     near, far = hand_target(walk, (0.35, -0.2, 1.2), 1.0, 4.0), hand_target(walk, (1.5, 0.3, 1.4), 2.0, 3.0)
@@ -219,7 +219,7 @@ def test_person_bodies_make_a_world():
 
 
 @pytest.mark.parametrize("kind", OBJECT_KINDS)
-def test_objects_have_their_tag_on_the_surface_and_their_twins(kind):
+def test_tags_lie_on_the_surface_and_equal_looks_give_equal_objects(kind):
     first = make_object(kind, np.random.default_rng(1), look=7)
     assert first == make_object(kind, np.random.default_rng(2), look=7)
     assert first != make_object(kind, np.random.default_rng(1), look=8)
@@ -254,7 +254,7 @@ def _outside(shape, point):
 
 @pytest.mark.parametrize("name", ROOMS)
 @pytest.mark.parametrize("seed", range(6))
-def test_rooms_have_room(name, seed):
+def test_rooms_are_within_their_size_and_have_free_places(name, seed):
     room = make_room(name, np.random.default_rng(seed))
     length, width, height = room.size_m
     World(room.bodies, (), 1, room.size_m).check()
@@ -280,7 +280,7 @@ def test_rooms_have_room(name, seed):
         assert 0 < point[2] < height
 
 
-def test_who_is_behind_the_screen_is_out_of_sight():
+def test_people_behind_the_partition_are_invisible():
     for seed in range(6):
         room = make_room("meeting_room", np.random.default_rng(seed))
         screen = next(body for body in room.bodies if body.name == "screen")
@@ -294,7 +294,7 @@ def test_who_is_behind_the_screen_is_out_of_sight():
                 assert abs(crossing[1] - middle[1]) < half[1]
 
 
-def test_seeds_decide_everything():
+def test_equal_seeds_give_equal_worlds():
     def draw(seed):
         rng = np.random.default_rng(seed)
         room = make_room("office", rng)

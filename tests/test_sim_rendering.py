@@ -251,7 +251,7 @@ def test_shadow_is_where_geometry_says(moves):
     np.testing.assert_array_equal(bright[floor & lit], flat[floor & lit])
 
 
-def test_what_moves_under_a_table_does_not_shade_its_top():
+def test_bodies_that_move_under_a_table_do_not_shade_its_top():
     """Nor the floor on which it stands: both touch."""
     raycaster = Raycaster(
         world(
@@ -268,7 +268,7 @@ def test_what_moves_under_a_table_does_not_shade_its_top():
     assert raycaster.lit(hits, raycaster.world.lights[0].position_m)[top].all()
 
 
-def test_light_falls_with_the_cosine_and_the_square_of_distance():
+def test_light_decreases_with_the_cosine_and_the_square_of_distance():
     """Lambert on a white floor under a lamp, and full light at 2 m from a lamp of power 1."""
     white = Material((0.9, 0.9, 0.9), "plain")
     floor = body("floor", "box", (9, 9, 0.5), (0, 0, -0.5), white)
@@ -280,7 +280,7 @@ def test_light_falls_with_the_cosine_and_the_square_of_distance():
     assert abs(radiance.max() - 0.9) < 1e-3
 
 
-def test_shine_glares_where_the_lamp_is_mirrored():
+def test_highlights_lie_where_the_lamp_is_reflected():
     glossy = Material((0.1, 0.1, 0.1), "plain", shine=0.8)
     raycaster = Raycaster(world(wall(3.0, glossy), lights=(Light((0.0, 0.6, 1.0)),), ambient=0.1))
     hits = raycaster.cast(AHEAD)
@@ -309,7 +309,7 @@ def test_three_levels_of_light():
 
 
 @pytest.mark.parametrize("name", ["bright", "dim", "dark"])
-def test_colour_noise_follows_its_law(name):
+def test_colour_noise_follows_its_model(name):
     level = ILLUMINATION[name]
     flat = np.full((200, 200, 3), 0.45, np.float32)
     picture = level.expose(flat, np.random.default_rng(1))
@@ -318,8 +318,8 @@ def test_colour_noise_follows_its_law(name):
     np.testing.assert_allclose(linear.std(), level.noise(np.full(1, 0.45))[0], rtol=0.06)
 
 
-def test_blur_smears_what_moves_by_its_speed():
-    """An edge that moves 1.2 m/s x 0.05 s at 2 m leaves a ramp of 4 px; what rests stays sharp."""
+def test_motion_blur_is_proportional_to_speed():
+    """An edge that moves 1.2 m/s x 0.05 s at 2 m leaves a ramp of 4 px; static surfaces stay sharp."""
     speed = np.stack([np.full(41, 1.9), np.linspace(-0.6, -0.12, 41), np.full(41, 1.0)], -1)
     white = Material((0.9, 0.9, 0.9), "plain")
     board = body("board", "box", (0.01, 0.3, 0.3), moving(speed), white)
@@ -391,7 +391,7 @@ def test_seeds_and_contrast_change_a_texture():
     assert look(texture="checker", scale=400.0, contrast=0.8).std() < 1e-3
 
 
-def test_photographs_that_are_missing_are_told(monkeypatch):
+def test_missing_photographs_give_a_warning(monkeypatch):
     monkeypatch.setitem(textures.PHOTOGRAPHS, "absent", ("no_such_package", "a.jpg"))
     material = Material((0.5, 0.5, 0.5), "photo", photo="absent", contrast=0.5)
     raycaster = Raycaster(world(wall(3.0, material)))
@@ -416,7 +416,7 @@ def flat_depth(sensor, distance_m, reflectance=0.5, shine=0.0, seed=0):
 
 @pytest.mark.parametrize("distance_m", [1.0, 2.5, 3.5])
 @pytest.mark.parametrize("name", ["kinect_v2", "xtion"])
-def test_depth_noise_follows_its_law(name, distance_m):
+def test_depth_noise_follows_its_model(name, distance_m):
     sensor = SENSORS[name]
     depth = flat_depth(sensor, distance_m)
     found = depth[depth > 0]
@@ -428,7 +428,7 @@ def test_depth_noise_follows_its_law(name, distance_m):
     assert abs(np.median(found) - distance_m) < 0.5 * law + 0.5 * distance_m**2 / 348 + 0.001
 
 
-def test_noise_laws_have_their_published_values():
+def test_noise_models_have_their_published_values():
     """Fankhauser et al. at 4 m, and at 2 m and 60 degrees; Nguyen et al. at 3 m."""
     half = np.full(1, 0.5)
     np.testing.assert_allclose(KinectV2().noise_m(np.full(1, 4.0), np.ones(1), half), 4.3e-3, rtol=1e-3)
@@ -461,7 +461,7 @@ def test_xtion_quantises_disparity_and_kinect_does_not():
     assert len(np.unique(fine)) > len(levels)
 
 
-def test_dark_far_shiny_and_near_surfaces_are_lost():
+def test_dark_far_shiny_and_near_surfaces_have_no_depth():
     for sensor in (KinectV2(), Xtion()):
         missing = {
             case: np.mean(flat_depth(sensor, *case) == 0)
@@ -478,7 +478,7 @@ def test_dark_far_shiny_and_near_surfaces_are_lost():
 
 
 @pytest.mark.parametrize("name", ["kinect_v2", "xtion"])
-def test_grazing_surfaces_are_lost(name):
+def test_grazing_surfaces_have_no_depth(name):
     """A floor from 1 m up, and from 0.15 m up: hardly any return at the same distance."""
     shares = []
     for height in (1.5, 0.12):
@@ -617,7 +617,7 @@ def test_forward_and_backward_flow_agree_where_visible(pair):
     assert np.median(error[moved]) < 0.01
 
 
-def test_warping_by_the_flow_gives_the_first_picture_back(pair):
+def test_warping_by_the_flow_reconstructs_the_first_picture(pair):
     raycaster, before, after, truth = pair
     shader = Shader(raycaster)
     one, two = shader.surface(before).albedo, shader.surface(after).albedo
@@ -651,8 +651,8 @@ def test_occlusion_agrees_with_rays_to_the_moved_points(pair, forward):
     assert np.sum(hidden & occluded) > 0.85 * hidden.sum()
 
 
-def test_what_turns_away_is_occluded():
-    """A ball that spins in place: what goes round the side is hidden, though the ball still covers the pixel."""
+def test_surfaces_that_turn_away_are_occluded():
+    """A ball that spins in place: points that move to the far side are hidden, though the ball still covers the pixel."""
     raycaster = Raycaster(
         world(body("ball", "sphere", (0.5, 0, 0), moving([[2, 0, 1]] * 2, [turned(0), turned(50)])), num_steps=2)
     )
@@ -668,7 +668,7 @@ def test_what_turns_away_is_occluded():
     assert np.mean(truth.forward_occluded[on] == away[on]) > 0.98
 
 
-def test_flow_needs_casts_of_one_stage(pair):
+def test_flow_needs_casts_of_one_world(pair):
     _, before, _, _ = pair
     other = Raycaster(world(wall(3.0))).cast(AHEAD)
     with pytest.raises(ValueError, match="one world"):

@@ -42,7 +42,7 @@ def test_static_tag_repeats_its_phase_within_a_channel():
     np.testing.assert_allclose(codes, 2 * np.rint(codes / 2), atol=1e-6)
 
 
-def test_pi_flips_come_at_their_share():
+def test_pi_flips_have_their_probability():
     reads = virtual_reads(STILL, "A", ReaderSettings(flip_probability=0.1), seed=0, antenna_m=np.zeros(3))
     share = pi_flip_share(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index)
     assert abs(share - 0.1) < 0.03
@@ -70,7 +70,7 @@ def test_settings_are_checked():
         ReaderSettings(num_tags=0)
 
 
-def test_virtual_reads_tell_the_track_back():
+def test_virtual_reads_reproduce_the_track():
     time_s = np.arange(40) / 7
     position = np.stack([0.2 * np.sin(time_s), 0 * time_s, 2.5 + 0.8 * np.sin(0.9 * time_s)], axis=-1)
     track = Track(time_s, position)
@@ -89,7 +89,7 @@ def test_same_seed_same_reads():
     assert one.num_reads != other.num_reads or np.any(one.phase_rad != other.phase_rad)
 
 
-def test_nothing_is_read_while_out_of_view():
+def test_tags_at_unknown_positions_are_not_read():
     position = STILL.position_m.copy()
     position[20:30] = np.nan
     reads = virtual_reads(

@@ -101,8 +101,8 @@ def _speed(path_m: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_every_train_leaves_as_many_traces_as_its_variant_says():
-    """All items: intervals in which any point of the train is in the picture and in sight, among all bodies."""
+def test_every_train_has_the_number_of_traces_of_its_variant():
+    """All items: intervals in which any point of the train is within the picture and not occluded by any body."""
     suite = _named("separated_traces")
     assert {variant.settings["num_traces"] for variant in suite.variants} == {2, 3, 4}
     for item in suite.items():
@@ -119,7 +119,7 @@ def test_every_train_leaves_as_many_traces_as_its_variant_says():
 
 
 @pytest.mark.parametrize("variant", ["two", "four"])
-def test_the_masks_of_a_film_come_and_go_as_often(variant):
+def test_the_masks_appear_and_disappear_as_often(variant):
     suite = _named("separated_traces")
     item = next(item for item in suite.items() if item.split == "test" and item.variant.name == variant)
     scenario = item_scenario(item)
@@ -133,8 +133,8 @@ def test_the_masks_of_a_film_come_and_go_as_often(variant):
 
 
 @pytest.mark.slow
-def test_everybody_comes_in_and_leaves():
-    """All items: no limb, no object is in the picture at either end; each person walks about in it between."""
+def test_every_person_enters_and_leaves():
+    """All items: no limb and no object is visible at either end; each person is visible in between."""
     suite = _named("enter_leave")
     for item in suite.items():
         scenario = item_scenario(item)
@@ -162,7 +162,7 @@ def test_everybody_comes_in_and_leaves():
         assert min(gap.min() for gap in apart) > 0.5
 
 
-def test_a_film_of_a_door_starts_and_ends_empty():
+def test_a_recording_of_a_door_starts_and_ends_empty():
     suite = _named("enter_leave")
     item = next(item for item in suite.items() if item.split == "test")
     scenario = item_scenario(item)
@@ -185,8 +185,8 @@ def _shop_items(name: str, all_items: bool) -> list:
 
 
 @pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_shop_is_as_the_paper_has_it(all_items):
-    """One and the same shop; level tags; still ones on a box near the exit; carried ones leave, or never near the exit."""
+def test_the_shop_agrees_with_the_paper(all_items):
+    """The same shop always; level dipoles; static tags on a box near the exit; carried tags leave, or never come near it."""
     furniture: dict[str, set] = {}
     stayed = carried = 0
     for item in _shop_items("shop_exit", all_items):
@@ -213,7 +213,7 @@ def test_the_shop_is_as_the_paper_has_it(all_items):
         for path in moving:
             stayed += path[:, 0].min() > EXIT_X_M + 0.3
             carried += 1
-            # Whoever leaves does so before the recording ends, and walks on for half a metre.
+            # People who leave do so before the recording ends, and walks on for half a metre.
             assert path[:, 0].min() > EXIT_X_M + 0.3 or path[-1, 0] < EXIT_X_M - 0.5, item.name
         for path in people[asked["num_people"] :]:
             # A bystander comes near the exit's line and never beyond it.
@@ -229,8 +229,8 @@ def test_the_shop_is_as_the_paper_has_it(all_items):
 
 
 @pytest.mark.slow
-def test_the_exit_hears_the_still_tags_all_the_time():
-    """First recordings: at least a read by the exit's antenna in every second, of every tag on the box."""
+def test_the_exits_antenna_reads_the_static_tags_all_the_time():
+    """First recordings: at least one read by the exit's antenna in every second, of every tag on the box."""
     for item in _shop_items("shop_exit", all_items=False):
         scenario = item_scenario(item)
         still = {tag.epc for tag in scenario.world.tags if np.ptp(tag_path(scenario.world, tag), axis=0).max() < 0.01}
@@ -245,8 +245,8 @@ def test_the_exit_hears_the_still_tags_all_the_time():
 
 
 @pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_thing_goes_from_hand_to_hand_and_onto_a_box(all_items):
-    """It is with the first person until they meet, with the second at once after, then at rest, and both leave."""
+def test_an_object_is_handed_over_and_put_onto_a_box(all_items):
+    """The first person holds it until they meet, then the second one, then it is stationary; both people leave."""
     for item in _shop_items("shop_handover", all_items):
         scenario = item_scenario(item)
         world = scenario.world
@@ -272,7 +272,7 @@ def test_a_thing_goes_from_hand_to_hand_and_onto_a_box(all_items):
         assert np.linalg.norm(one - other, axis=1).min() > 0.6, item.name
 
 
-def test_the_grid_is_a_level_label_both_ways_round():
+def test_the_grid_has_a_level_dipole_in_two_directions():
     scenario = item_scenario(_shop_items("shop_grid", all_items=False)[0])
     (tag,) = scenario.world.tags
     path, axis = tag_path(scenario.world, tag), tag_dipole(scenario.world, tag)
@@ -291,14 +291,14 @@ def test_the_grid_is_a_level_label_both_ways_round():
 
 
 @pytest.mark.parametrize(("name", "variant"), [("planar_tracks", "three"), ("shop_exit", "sp_mt_4")])
-def test_things_do_not_pass_through_each_other(name, variant):
-    """All items: the boxes round two things, turned with them but taken as upright, never overlap."""
+def test_objects_do_not_pass_through_each_other(name, variant):
+    """All items: the bounding boxes of two objects, rotated about the vertical, never overlap."""
     for item in _named(name).items():
         if item.variant.name != variant:
             continue
         scenario = item_scenario(item)
-        things = [scenario.world.bodies[tag.body] for tag in scenario.world.tags]
-        for one, other in itertools.combinations(things, 2):
+        objects = [scenario.world.bodies[tag.body] for tag in scenario.world.tags]
+        for one, other in itertools.combinations(objects, 2):
             (low, high), (bottom, top) = bounds(one.shapes), bounds(other.shapes)
             between = one.poses.position_m - other.poses.position_m
             across = (
@@ -309,8 +309,8 @@ def test_things_do_not_pass_through_each_other(name, variant):
 
 
 @pytest.mark.ci
-def test_people_walk_as_fast_as_the_suite_says():
-    """All items: the asked speed is reached on the legs and kept there; what is traced is the person, with a badge."""
+def test_people_walk_at_the_speed_of_the_suite():
+    """All items: the given speed is reached and kept on the straight parts; the labelled object is the person, with a badge."""
     for item in (suite := _named("speed")).items():
         scenario = item_scenario(item)
         asked = item.variant.settings["speed_m_s"]
@@ -329,8 +329,8 @@ def test_people_walk_as_fast_as_the_suite_says():
         assert rate.max() > 0.6 * asked or suite.duration_s * asked < 3.5, item.name
 
 
-def test_hands_wave_as_fast_as_the_suite_says():
-    """All items: at rest for 2 s, then a peak of exactly the asked speed within the push that it needs."""
+def test_hands_wave_at_the_speed_of_the_suite():
+    """All items: stationary for 2 s, then exactly the given peak speed within the acceleration bound."""
     suite = _named("velocity_threshold")
     assert sorted(variant.settings["speed_m_s"] for variant in suite.variants) == [0.5, 2.5]
     for item in suite.items():
@@ -344,7 +344,7 @@ def test_hands_wave_as_fast_as_the_suite_says():
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_every_suite_finds_room_for_its_story(path):
+def test_every_suite_has_a_scenario_for_each_item(path):
     suite = _suite(path)
     if suite.story == PLANAR:
         return
@@ -355,7 +355,7 @@ def test_every_suite_finds_room_for_its_story(path):
 
 
 @pytest.mark.parametrize("number", [0, 7, 19])
-def test_trains_of_like_phase_differ_by_half_a_wavelength_in_range(number):
+def test_trains_of_equal_phase_differ_by_half_a_wavelength_in_range(number):
     suite = _named("half_wavelength")
     item = next(item for item in suite.items() if item.split == "test" and item.number == number)
     capture = dataclasses.replace(suite.capture, width=32, frame_rate_hz=3.0)
@@ -396,7 +396,7 @@ def test_readers_and_stories_differ_by_variant():
     assert any(body.role == "person" for body in hand.world.bodies)
 
 
-def test_a_killed_run_goes_on_and_repeats_exactly(tmp_path):
+def test_a_killed_run_resumes_and_repeats_exactly(tmp_path):
     suite = _tiny()
     made = make_suite(suite, tmp_path / "a")
     assert [one.name for one in made] == ["tiny-one-test-0", "tiny-two-test-0"]
@@ -441,7 +441,7 @@ def test_every_suite_in_small(path, tmp_path):
             open_recording(item.path(tmp_path)).check()
 
 
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
+def test_a_folder_with_other_contents_is_left_unchanged(tmp_path):
     home = tmp_path / "tiny"
     home.mkdir()
     (home / "thesis.txt").write_text("precious")
@@ -456,7 +456,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
     assert json.loads((home / MANIFEST).read_text())["seed"] == 5
 
 
-def test_a_suite_may_grow(tmp_path):
+def test_counts_of_a_suite_may_grow(tmp_path):
     few, more = (dataclasses.replace(_tiny(), counts=Counts(0, 0, number)) for number in (1, 3))
     for item in prepare(few, tmp_path):
         item.path(tmp_path).mkdir(parents=True)
@@ -482,7 +482,7 @@ def test_impossible_suites_are_refused():
     with pytest.raises(ConfigError, match="unknown key 'durations'"):
         from_mapping(Suite, {**given, "durations": 3})
     full = Suite("x", "x", "x", "tabletop", 1, settings={"num_objects": 40}, counts=Counts(0, 0, 1))
-    with pytest.raises(ValueError, match=r"x-all-test-0 .*draws in vain.*do not fit"):
+    with pytest.raises(ValueError, match=r"x-all-test-0 .*draws failed.*do not fit"):
         item_scenario(full.items()[0])
 
 

@@ -24,18 +24,18 @@ pytestmark = pytest.mark.ci
 
 C = 299_792_458.0
 FOLDER = Path(__file__).parents[1] / "conf" / "benchmark"
-STILL_S = 20.0
+STATIONARY_S = 20.0
 QUIET = {"outages_per_minute": 0.0}
 
 
-def _stage(name: str, duration_s: float, **settings) -> Scenario:
-    """The world of a suite's first test recording, told for longer or shorter."""
+def _scenario(name: str, duration_s: float, **settings) -> Scenario:
+    """The world of a suite's first test recording, with another duration."""
     suite = from_mapping(Suite, yaml.safe_load((FOLDER / f"{name}.yaml").read_text()))
     suite = dataclasses.replace(suite, duration_s=duration_s, settings={**suite.settings, **settings})
     return item_scenario(next(item for item in suite.items() if item.split == "test"))
 
 
-def _film(scenario: Scenario, seed: int = 3, **inventory) -> Recording:
+def _simulate(scenario: Scenario, seed: int = 3, **inventory) -> Recording:
     """A frame every two seconds, 64 pixels wide; `inventory` replaces settings of the reader."""
     settings = dataclasses.replace(scenario.inventory, **{**QUIET, **inventory})
     suite = from_mapping(Suite, yaml.safe_load((FOLDER / "multi_2.yaml").read_text()))
@@ -44,28 +44,28 @@ def _film(scenario: Scenario, seed: int = 3, **inventory) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def still_world() -> Scenario:
-    """Twenty still tags in an office; for the first `STILL_S` nobody moves."""
-    return _stage("static_tags", 2.5 * STILL_S, stationary_s=STILL_S)
+def static_world() -> Scenario:
+    """Twenty static tags in an office; for the first `STATIONARY_S` nothing moves."""
+    return _scenario("static_tags", 2.5 * STATIONARY_S, stationary_s=STATIONARY_S)
 
 
 @pytest.fixture(scope="module")
-def still(still_world) -> Recording:
+def static(static_world) -> Recording:
     """Read in a mode without pi flips, by a reader whose clock is off and drifts."""
-    return _film(still_world, flip_probability=0.0, clock_offset_s=0.37, clock_drift_ppm=42.0)
+    return _simulate(static_world, flip_probability=0.0, clock_offset_s=0.37, clock_drift_ppm=42.0)
 
 
 @pytest.fixture(scope="module")
-def flipping(still_world) -> Recording:
+def flipping(static_world) -> Recording:
     """Read in the default, Miller, mode."""
-    return _film(still_world)
+    return _simulate(static_world)
 
 
 @pytest.fixture(scope="module")
 def counted() -> dict[str, Recording]:
     """1, 2, 4, 6 and 12 tags."""
     names = ("single_static", "multi_2", "multi_4", "ceiling_6", "crowd")
-    return {name: _film(_stage(name, 12.0)) for name in names}
+    return {name: _simulate(_scenario(name, 12.0)) for name in names}
 
 
 def _time_s(recording: Recording) -> np.ndarray:
@@ -75,7 +75,7 @@ def _time_s(recording: Recording) -> np.ndarray:
 
 def _at_rest(recording: Recording) -> dict[str, np.ndarray]:
     """Indices of the reads while nothing moves, by EPC, of tags that are read often."""
-    early = _time_s(recording) < STILL_S - 0.5
+    early = _time_s(recording) < STATIONARY_S - 0.5
     found = {epc: np.flatnonzero(early & (recording.reads.epc == epc)) for epc in recording.reads.epcs}
     return {epc: reads for epc, reads in found.items() if len(reads) > 60}
 
@@ -95,9 +95,9 @@ def _spread(values: np.ndarray, groups: np.ndarray) -> float:
     return float(np.sqrt(np.sum(apart**2) / np.sum(count - 1)))
 
 
-def test_a_round_takes_its_base_and_a_slot_for_each_tag_that_answers(counted, still):
+def test_a_round_takes_its_base_and_a_slot_for_each_tag_that_replies(counted, static):
     """Counted: 17.3 ms + 4.23 ms for each tag, rms error 2 ms."""
-    num, took = (np.concatenate(part) for part in zip(*map(_rounds, [*counted.values(), still]), strict=True))
+    num, took = (np.concatenate(part) for part in zip(*map(_rounds, [*counted.values(), static]), strict=True))
     # A read that is lost makes two rounds one.
     single = took < 1.5 * (17.3e-3 + 4.23e-3 * num)
     assert single.mean() > 0.9
@@ -111,7 +111,7 @@ def test_a_round_takes_its_base_and_a_slot_for_each_tag_that_answers(counted, st
     [("single_static", 1, 46.5), ("multi_2", 2, 37), ("multi_4", 4, 29), ("ceiling_6", 6, 25), ("crowd", 12, 15)],
 )
 def test_reads_a_second_of_a_tag(counted, name, tags, rate):
-    """Counted: per tag, of the tags that are well heard (the fit for one tag, of which that log has none)."""
+    """Counted: per tag, of the tags with strong signals (the fit for one tag, of which that log has none)."""
     recording = counted[name]
     assert len(recording.reads.epcs) == tags
     duration_s = (recording.time_ns[-1] - recording.time_ns[0]) * 1e-9
@@ -119,18 +119,18 @@ def test_reads_a_second_of_a_tag(counted, name, tags, rate):
     np.testing.assert_allclose(np.mean(counts[-max(1, tags // 3) :]), rate, rtol=0.15)
 
 
-def test_twenty_tags_share_the_reader(still):
-    """Counted: 10 reads/s of each of 20 tags; what is not heard takes no slot."""
-    rates = [len(reads) / (STILL_S - 0.5) for reads in _at_rest(still).values()]
+def test_twenty_tags_share_the_reader(static):
+    """Counted: 10 reads/s of each of 20 tags; tags out of range take no slot."""
+    rates = [len(reads) / (STATIONARY_S - 0.5) for reads in _at_rest(static).values()]
     assert len(rates) >= 14
     np.testing.assert_allclose(np.median(rates), 10.0, rtol=0.15)
 
 
-def test_phase_noise_by_rssi(still):
+def test_phase_noise_by_rssi(static):
     """Rail: 0.014 rad at -46 dBm to 0.080 at -67 within a channel; the floor is the recording's, 0.012 to 0.02."""
-    reads = still.reads
+    reads = static.reads
     level, residual, group = [], [], []
-    for number, rows in enumerate(_at_rest(still).values()):
+    for number, rows in enumerate(_at_rest(static).values()):
         keys = reads.channel_index[rows].astype(int) + 100 * number
         _, inverse = np.unique(keys, return_inverse=True)
         turn = np.exp(1j * reads.phase_rad[rows])
@@ -153,13 +153,13 @@ def test_phase_noise_by_rssi(still):
         assert np.hypot(0.011, 0.8 * line) < sigma < np.hypot(0.022, 1.25 * line), (rssi, sigma)
 
 
-def test_rssi_spreads_within_and_over_channels(still):
+def test_rssi_spreads_within_and_over_channels(static):
     """Rail: 0.1 dB within a channel at -46 dBm, 0.3 to 0.4 at -62 to -68; hopping: 4.8 to 6.4 dB over the band, each in
     steps of 0.5 dB.
     """
-    reads = still.reads
+    reads = static.reads
     strong, weak, over = [], [], []
-    for rows in _at_rest(still).values():
+    for rows in _at_rest(static).values():
         channel, rssi = reads.channel_index[rows], reads.rssi_dbm[rows].astype(float)
         level = np.median(rssi)
         if level > -50:
@@ -176,7 +176,7 @@ def test_rssi_spreads_within_and_over_channels(still):
     assert 3.5 < np.median(over) < 8.5
 
 
-def test_pi_flips_come_where_the_mode_has_them(still, flipping):
+def test_pi_flips_come_where_the_mode_has_them(static, flipping):
     """Logs: 11 to 21 % of the steps within a channel in Miller modes, none in FM0."""
 
     def steps(recording):
@@ -191,12 +191,12 @@ def test_pi_flips_come_where_the_mode_has_them(still, flipping):
 
     assert len(steps(flipping)) > 600
     assert 0.11 < np.mean(steps(flipping)) < 0.21
-    assert np.mean(steps(still)) < 0.002
+    assert np.mean(steps(static)) < 0.002
     assert flipping.reads.pi_flips
-    assert not still.reads.pi_flips
+    assert not static.reads.pi_flips
 
 
-@pytest.mark.parametrize("which", ["still", "flipping"])
+@pytest.mark.parametrize("which", ["static", "flipping"])
 def test_the_offset_over_channels_is_affine(which, request):
     """Logs: 0.31 to 0.43 rad/MHz in size, one for all tags; what reflections add differs from tag to tag."""
     recording = request.getfixturevalue(which)
@@ -216,9 +216,9 @@ def test_the_offset_over_channels_is_affine(which, request):
     assert np.std(slopes) < 0.06
 
 
-def test_a_channel_is_held_for_a_fifth_of_a_second(still):
+def test_a_channel_is_held_for_a_fifth_of_a_second(static):
     """Counted and hopping: 0.203 s in the median, 0.195 to 0.215; the order is the reader's own."""
-    reads, time_s = still.reads, _time_s(still)
+    reads, time_s = static.reads, _time_s(static)
     first = np.append(0, np.flatnonzero(np.diff(reads.channel_index)) + 1)
     dwell = np.diff(time_s[first])[1:]
     assert abs(np.median(dwell) - 0.203) < 0.005
@@ -231,20 +231,20 @@ def test_a_channel_is_held_for_a_fifth_of_a_second(still):
     np.testing.assert_array_equal(reads.carrier_hz, table[reads.channel_index.astype(int) - 1])
 
 
-def test_the_clock_is_recovered(still):
+def test_the_clock_is_recovered(static):
     """Offset to the latency of 5 to 50 ms, drift to 8 ppm; corrected times run with the host's."""
-    assert still.clock is not None
-    assert still.reads.reader_time_ns is not None
-    np.testing.assert_allclose(still.clock.drift_ppm, 42.0, atol=8.0)
-    np.testing.assert_allclose(still.clock.offset_s, 0.37 + 0.006, atol=0.004)
-    ran = np.diff(still.reads.time_ns[[0, -1]])[0] / np.diff(still.reads.reader_time_ns[[0, -1]])[0]
+    assert static.clock is not None
+    assert static.reads.reader_time_ns is not None
+    np.testing.assert_allclose(static.clock.drift_ppm, 42.0, atol=8.0)
+    np.testing.assert_allclose(static.clock.offset_s, 0.37 + 0.006, atol=0.004)
+    ran = np.diff(static.reads.time_ns[[0, -1]])[0] / np.diff(static.reads.reader_time_ns[[0, -1]])[0]
     np.testing.assert_allclose(ran - 1, 42e-6, atol=8e-6)
 
 
 def test_corrected_times_fit_the_motion():
-    """A waved tag's phase follows its path best where reads are late by the least latency, 5 ms."""
-    scenario = _stage("single_static", 8.0, speed_m_s=1.5)
-    recording = _film(scenario, flip_probability=0.0)
+    """A waved tag's phase follows its path best where reads are late by the smallest latency, 5 ms."""
+    scenario = _scenario("single_static", 8.0, speed_m_s=1.5)
+    recording = _simulate(scenario, flip_probability=0.0)
     reads = recording.reads
     path = np.linalg.norm(tag_path(scenario.world, scenario.world.tags[0]) - np.asarray(scenario.antennas_m[0]), axis=1)
     steps_s = np.arange(len(path)) * STEP_S
