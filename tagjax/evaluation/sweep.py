@@ -133,7 +133,7 @@ def _items(config: SweepConfig, suite: Suite, tell: Callable[[str], None]) -> li
         suite,
         Path(config.out),
         splits=config.splits,
-        most=config.most,
+        max_per_variant=config.most,
         workers=config.workers,
         on_done=lambda made: tell(made.name),
     )

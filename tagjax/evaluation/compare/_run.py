@@ -98,7 +98,7 @@ def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> 
         suite,
         Path(config.out),
         splits=(config.split,),
-        most=config.most,
+        max_per_variant=config.most,
         workers=config.workers,
         on_done=lambda one: tell(f"simulated {one.name}"),
     )
