@@ -14,7 +14,6 @@ import synthetic_clips as synthetic
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from experiments.benchmark import with_cases
 from tagjax.benchmarks.flow_speed import moved_pictures
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings, evaluate_flows, flow_tables
@@ -358,12 +357,6 @@ def test_the_configuration_fits_its_schema_and_names_every_key():
     assert set(values) == {field.name for field in dataclasses.fields(FlowEvaluationSettings)}
     with pytest.raises(ConfigError, match="unknown key 'flow'"):
         from_mapping(FlowEvaluationSettings, {"flow": "dis"})
-
-
-def test_bare_words_name_the_cases_of_a_benchmark():
-    assert with_cases(["flow", "repeats=3"]) == ["cases=[flow]", "repeats=3"]
-    assert with_cases(["flow", "gather", "--help"]) == ["cases=[flow,gather]", "--help"]
-    assert with_cases(["cases=[flow]"]) == ["cases=[flow]"]
 
 
 # Real pictures

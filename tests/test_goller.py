@@ -1224,14 +1224,14 @@ def test_all_that_is_missing_is_named_before_anything_is_observed(tmp_path):
 
     grid, shop = tmp_path / "grid.zarr", tmp_path / "shop_exit"
     config = GollerConfig(grid=str(grid), scenarios=str(shop), handover=str(tmp_path / "nowhere"))
-    with pytest.raises(ValueError, match=r"benchmark=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
+    with pytest.raises(ValueError, match=r"suite=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
         run_goller(config, opened, tmp_path)
     grid.mkdir()
     for split in ("train", "validation", "test"):
         with pytest.raises(ValueError, match=rf"shop_exit: no recording in .*{split}/"):
             run_goller(dataclasses.replace(config, handover=None), opened, tmp_path)
         (shop / split / f"shop_exit-sp_st-{split}-0.zarr").mkdir(parents=True)
-    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate benchmark=shop_handover`"):
+    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate suite=shop_handover`"):
         run_goller(config, opened, tmp_path)
     # Where none is named those beside the scenarios are taken, if there are any.
     default = dataclasses.replace(config, handover=None)

@@ -482,7 +482,7 @@ def test_a_run_writes_its_report(tmp_path, monkeypatch):
     monkeypatch.setattr("tagjax.baselines.tagview._tracer.make_detector", lambda settings: Perfect())
     match = MatchSettings(origin="antenna", least_spread=0.1)
     config = TagviewExperiment(
-        recordings=str(tmp_path / "rec"),
+        recordings_dir=str(tmp_path / "rec"),
         suites=("ceiling_2",),
         matching={"tagview": Matching(match), "alone": Matching(dataclasses.replace(match, programme=False))},
     )
@@ -497,7 +497,7 @@ def test_a_run_writes_its_report(tmp_path, monkeypatch):
         assert (tmp_path / "out" / name).stat().st_size > 0
     with pytest.raises(ValueError, match="no recording"):
         run_tagview(dataclasses.replace(config, suites=("ceiling_9",)), tmp_path / "none")
-    with pytest.raises(ValueError, match="whole"):
+    with pytest.raises(ValueError, match="complete"):
         TagviewExperiment(suites=("a",), matching={})
 
 
