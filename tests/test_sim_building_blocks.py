@@ -74,13 +74,13 @@ def test_wave_has_the_given_peak_speed_and_zero_speed_at_both_ends(kind, speed):
 
 
 def test_impossible_motions_are_refused():
-    with pytest.raises(ValueError, match="slow it down"):
+    with pytest.raises(ValueError, match="Lower the speed"):
         trajectory.wave("line", (0, 0, 0), 5.0, peak_speed_m_s=2.5, amplitude_m=0.1)
     with pytest.raises(ValueError, match="same"):
         trajectory.path_through([[0, 0, 0], [0, 0, 0]], speed_m_s=1.0)
-    with pytest.raises(ValueError, match="meet"):
+    with pytest.raises(ValueError, match="from the end of the previous one"):
         trajectory.join(trajectory.stay_at((0, 0, 0), 1.0), trajectory.stay_at((1, 0, 0), 1.0))
-    with pytest.raises(ValueError, match="more than"):
+    with pytest.raises(ValueError, match="expected at most duration_s"):
         trajectory.wait_then_move(trajectory.stay_at((0, 0, 0), 2.0), 1.0, 2.0)
 
 
@@ -118,7 +118,7 @@ def test_walkers_keep_their_distance_to_each_other_and_to_furniture(name):
 def test_walkers_without_room_are_refused():
     with pytest.raises(ValueError, match="No free place"):
         walks.random_walks(9, 1.0, np.random.default_rng(0), area_m=(0.0, 0.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="through a door"):
+    with pytest.raises(ValueError, match="num_door is 1"):
         walks.random_walks(2, 1.0, np.random.default_rng(0), area_m=(0.0, 0.0, 4.0, 4.0), num_door=1)
 
 
@@ -314,9 +314,9 @@ def test_equal_seeds_give_equal_worlds():
 
 def test_unknown_names_are_refused():
     rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match="known are"):
+    with pytest.raises(ValueError, match="expected one of"):
         make_object("piano", rng)
-    with pytest.raises(ValueError, match="known are"):
+    with pytest.raises(ValueError, match="expected one of"):
         make_room("attic", rng)
     with pytest.raises(ValueError, match=r"0\.9 to 2\.2"):
         make_person(rng, height_m=3.0)
