@@ -286,7 +286,7 @@ def test_recordings_shorter_than_a_clip_are_named(recording: Recording) -> None:
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_no_motion_loses_all_coherence_and_none_less_than_nothing(share: float) -> None:
-    with pytest.raises(ConfigError, match=rf"min_motion is {share}; expected a share of coherence"):
+    with pytest.raises(ConfigError, match=rf"min_motion is {share}; expected a loss of coherence"):
         ClipSettings(min_motion=share)
 
 

@@ -352,6 +352,8 @@ def test_unknown_flows_are_refused_before_anything_is_computed(tmp_path):
 def test_the_configuration_fits_its_schema_and_names_every_key():
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         values = OmegaConf.to_container(compose("evaluate_flow"), resolve=True)
+    assert isinstance(values, dict)
+    values.pop("paths")
     settings = from_mapping(FlowEvaluationSettings, values)
     assert settings.pairs.height == 160
     assert set(values) == {field.name for field in dataclasses.fields(FlowEvaluationSettings)}

@@ -22,15 +22,7 @@ from tagjax.flow.estimates import NetworkFlow
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.named import make_flow
 from tagjax.flow.network import AbstractFlowNetwork
-from tagjax.flow.picture_pairs import (
-    ImageFolder,
-    PairSource,
-    StackedPairs,
-    VariationSettings,
-    open_sequence,
-    pair_dataset,
-    vary,
-)
+from tagjax.flow.picture_pairs import ImageFolder, PairSource, StackedPairs, VariationSettings, open_sequence, pair_dataset, vary
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
 from tagjax.recording import RecordingError

@@ -188,7 +188,7 @@ def test_label_pictures_are_whole_and_of_the_frames_size(tmp_path: Path) -> None
     np.testing.assert_array_equal(labelled.truth.labels[:], recording.truth.labels[:])
 
     odd = dataclasses.replace(settings, reader={"foo": 1})
-    with pytest.raises(ConfigError, match=r"virtual_tag\.reader: unknown key 'foo'; known are region, num_tags"):
+    with pytest.raises(ConfigError, match=r"virtual_tag\.reader: unknown key 'foo'; known keys are region, num_tags"):
         with_virtual_tags(dataclasses.replace(recording, truth=None), odd)
 
     second = tmp_path / "00000001.png"

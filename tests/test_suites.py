@@ -1,4 +1,4 @@
-"""Benchmark suites: every file under conf/benchmark is one, splits are apart, and runs resume and repeat exactly."""
+"""Suites: every file under conf/suite is one, splits are apart, and runs resume and repeat exactly."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, 
 from tagjax.sim.world.bodies import STEP_S, tag_dipole, tag_path
 from tagjax.sim.world.objects import bounds
 
-FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
+FILES = sorted((Path(__file__).parents[1] / "conf" / "suite").glob("*.yaml"))
 
 
 def _suite(path: Path) -> Suite:

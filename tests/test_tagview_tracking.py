@@ -13,33 +13,7 @@ import numpy as np
 import pytest
 
 from tagjax.baselines import HostCamera, HostFrame, host_trace
-from tagjax.baselines.tagview import (
-    AbstractDetector,
-    BoxDetector,
-    BoxNetwork,
-    BoxTracks,
-    DetectorSettings,
-    LabelledFrame,
-    MatchSettings,
-    MotionDetector,
-    SortSettings,
-    TagviewSettings,
-    TagviewTracer,
-    TrainSettings,
-    detection_loss,
-    from_inclusive,
-    labelled_frames,
-    load_detector,
-    make_detector,
-    measure_detector,
-    middle_px,
-    overlap,
-    save_detector,
-    suppress,
-    track_boxes,
-    train_detector,
-    undistorted,
-)
+from tagjax.baselines.tagview import AbstractDetector, BoxDetector, BoxNetwork, BoxTracks, DetectorSettings, LabelledFrame, MatchSettings, MotionDetector, SortSettings, TagviewSettings, TagviewTracer, TrainSettings, detection_loss, from_inclusive, labelled_frames, load_detector, make_detector, measure_detector, middle_px, overlap, save_detector, suppress, track_boxes, train_detector, undistorted
 from tagjax.baselines.tagview._anchors import decode, default_boxes, encode, targets
 from tagjax.evaluation.tagview import Matching, TagviewExperiment, run_tagview, table, true_stretches, watch
 from tagjax.evaluation.tagview._judge import owners

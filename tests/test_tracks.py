@@ -14,30 +14,8 @@ import pytest
 import yaml
 
 from tagjax.core.settings import from_mapping
-from tagjax.evaluation.real_tags import (
-    SCORES,
-    align,
-    associate,
-    heard_speed,
-    places_around,
-    speed_scores,
-    speed_windows,
-)
-from tagjax.evaluation.tracks import (
-    METHODS,
-    Scene,
-    TracksConfig,
-    antenna_place,
-    association_scores,
-    load_kinect,
-    load_scenes,
-    load_xovis,
-    real_tags_markdown,
-    right,
-    run_real_tags,
-    run_tracks,
-    windows,
-)
+from tagjax.evaluation.real_tags import SCORES, align, associate, heard_speed, places_around, speed_scores, speed_windows
+from tagjax.evaluation.tracks import METHODS, Scene, TracksConfig, antenna_place, association_scores, load_kinect, load_scenes, load_xovis, real_tags_markdown, right, run_real_tags, run_tracks, windows
 from tagjax.recording import RecordingError
 from tagjax.recording.importers.tagged_walks import Speeds, Walk, load_tagged, load_uwb
 from tagjax.tagattention.attention import coherent_score
@@ -177,7 +155,7 @@ def test_noise_of_a_track_costs_the_doubled_angle_more_than_flips_cost_the_plain
 
 def test_the_configuration_names_every_setting():
     values: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "conf" / "tracks.yaml").read_text())
-    values.pop("hydra")
+    values.pop("defaults")
     assert from_mapping(TracksConfig, {**values, "folder": "x"}) == TracksConfig("x")
     assert set(values) == {field.name for field in dataclasses.fields(TracksConfig)}
 
