@@ -22,7 +22,8 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tagjax.evaluation.benchmark import BenchmarkSettings, machine, run_benchmark
+    from tagjax.benchmarks.stages import BenchmarkSettings, run_benchmark
+    from tagjax.core.machine import machine
 
     console = Console(width=None if sys.stdout.isatty() else 140)  # a file has no width of its own
     settings, written, timings = checked(BenchmarkSettings, values, folder), folder / "benchmark.json", []

@@ -50,7 +50,7 @@ def plain_values(config: DictConfig) -> dict[str, Any]:
 
 def checked(schema: type[T], values: Mapping[str, Any], folder: Path) -> T:
     """The settings, validated; the values are then written to the run folder's config.yaml."""
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
 
     settings = from_mapping(schema, values)
     write_config(values, folder)
@@ -64,6 +64,6 @@ def write_config(values: Mapping[str, Any], folder: Path) -> None:
 
 def print_result(result: Any) -> None:
     """Print a result as JSON, the last line of a command's output."""
-    from tagjax.evaluation.report import plain
+    from tagjax.report.report import plain
 
     print(json.dumps(plain(result), allow_nan=False))

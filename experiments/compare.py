@@ -20,7 +20,7 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.compare import CompareConfig, console_table, run_comparison
 
     progress, console = values.pop("progress"), Console()

@@ -33,9 +33,9 @@ def run_configuration(run: str | None) -> dict[str, Any] | None:
 def main(values: dict[str, Any], folder: Path) -> float:
     from rich.console import Console
 
-    from tagjax.config import EvaluateConfig, from_mapping
-    from tagjax.evaluation.report import score_table
-    from tagjax.evaluation.run import run_evaluation
+    from tagjax.core.settings import from_mapping
+    from tagjax.evaluation.run import EvaluateConfig, run_evaluation
+    from tagjax.report.report import score_table
 
     suite, options = values.pop("suite", None), {key: values.pop(key) for key in ("max_recordings", "smoke")}
     split, recordings_dir = values.pop("split"), values.pop("recordings_dir")

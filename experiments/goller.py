@@ -18,8 +18,8 @@ from .command import checked, command, print_result
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
-    from tagjax.data.store import open_recording
     from tagjax.evaluation.goller import GollerConfig, run_goller
+    from tagjax.recording.store import open_recording
 
     config, console = checked(GollerConfig, values, folder), Console()
     with console.status("tracking", spinner="line") as status:

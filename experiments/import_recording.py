@@ -17,7 +17,7 @@ from .command import checked, command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
-    from tagjax.data.importers.settings import ImportSettings, import_recording
+    from tagjax.recording.importers.settings import ImportSettings, import_recording
 
     console = Console(soft_wrap=True, highlight=False)
     _, lines = import_recording(checked(ImportSettings, values, folder))

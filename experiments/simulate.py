@@ -20,9 +20,9 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from rich.console import Console
 
-    from tagjax.config import SimulateConfig, from_mapping
-    from tagjax.sim.suites import Suite, make_suite
-    from tagjax.viz.contact_sheet import save_glance, save_sheet
+    from tagjax.core.settings import from_mapping
+    from tagjax.sim.contact_sheet import save_glance, save_sheet
+    from tagjax.sim.suites import SimulateConfig, Suite, make_suite
 
     from .progress import counting_bar
 

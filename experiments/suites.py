@@ -33,14 +33,14 @@ def suite_recordings(
 
     `max_recordings` limits those of each variant. Raises `ValueError` where the suite has none in this split.
     """
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.sim.suites import Suite, make_items
 
     chosen = from_mapping(Suite, suite, where="suite")
     chosen = chosen.smoke() if smoke else chosen
     folder = Path(recordings_dir)
     items = make_items(
-        chosen, folder, splits=(split,), most=max_recordings, workers=os.cpu_count() or 1, on_done=on_done
+        chosen, folder, splits=(split,), max_per_variant=max_recordings, workers=os.cpu_count() or 1, on_done=on_done
     )
     if not items:
         raise ValueError(f"suite {chosen.name} has no {split} recording; expected some: set suite.counts.{split}.")

@@ -21,7 +21,7 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> float:
     from rich.console import Console
 
-    from tagjax.config import from_mapping
+    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.sweep import SweepConfig, run_sweep, table
 
     from .progress import counting_bar

@@ -25,7 +25,8 @@ OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
 
 @command
 def main(values: dict[str, Any], folder: Path) -> float | None:
-    from tagjax.config import TrainConfig, from_mapping
+    from tagjax.core.settings import from_mapping
+    from tagjax.training.config import TrainConfig
     from tagjax.training.loop import DivergedError
     from tagjax.training.run import run_training
 

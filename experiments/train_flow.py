@@ -18,7 +18,8 @@ from .run_folder import keep_configuration
 
 @command
 def main(values: dict[str, Any], folder: Path) -> float | None:
-    from tagjax.config import TrainFlowConfig, from_mapping
+    from tagjax.core.settings import from_mapping
+    from tagjax.training.flow_config import TrainFlowConfig
     from tagjax.training.flow_run import run_flow_training
     from tagjax.training.loop import DivergedError
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from hydra import compose, initialize_config_dir
 
 from experiments.command import plain_values
-from tagjax.config import from_mapping
+from tagjax.core.settings import from_mapping
 
 CONF = Path(__file__).parents[1] / "conf"
 

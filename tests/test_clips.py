@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax._numerics import SPEED_OF_LIGHT_M_S
-from tagjax.config import ClipSettings, ConfigError, DataSettings, VirtualTagSettings
-from tagjax.data.clips import choose_antennas, clip_dataset, load_clip, motion_heard
+from tagjax.core.numerics import SPEED_OF_LIGHT_M_S
+from tagjax.core.settings import ConfigError
 from tagjax.recording import Recording, RecordingError, RecordingWarning, TagReads
-from tagjax.training.sources import join_reads, training_recordings
+from tagjax.recording.opening import VirtualTagSettings
+from tagjax.recording.reads import join_reads
+from tagjax.tracing.clips import ClipSettings, choose_antennas, load_clip
+from tagjax.training.clip_dataset import clip_dataset, motion_heard
+from tagjax.training.sources import DataSettings, training_recordings
 
 ANTENNAS_M = np.array([[0.0, 0.0, 0.0], [0.5, -0.3, 4.0], [9.0, 9.0, 9.0]])
 SMALL = {"stride": 2, "flow": "dis_ultrafast"}

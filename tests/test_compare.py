@@ -19,21 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.suites import suites_named
-from tagjax.baselines.goller import (
-    AntennaModel,
-    Calibration,
-    GollerTracer,
-    make_association,
-    make_location,
-    save_calibration,
-)
-from tagjax.config import ConfigError, from_mapping
+from tagjax.baselines.goller import AntennaModel, Calibration, GollerTracer, make_association, make_location, save_calibration
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
 from tagjax.evaluation.compare._run import _score, _Tally
 from tagjax.evaluation.compare._table import bars, write_csv
+from tagjax.report.comparison import bar_plot
 from tagjax.sim.suites import Item, Suite, Variant
-from tagjax.tracer import Trace
-from tagjax.viz.comparison import bar_plot
+from tagjax.tracing.tracer import Trace
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -148,7 +141,7 @@ def test_false_alarms_are_claims_of_tags_that_lie_still_labelled_or_not(monkeypa
             centre_m=jnp.zeros((4, 3)),
             step_m=jnp.zeros((4, 1)),
             confidence=jnp.full(4, 0.45),  # a claim counts alike in P_D and P_FA, whatever it is worth
-            found=jnp.array([claimed[one] for one in order]),
+            detected=jnp.array([claimed[one] for one in order]),
         )
 
     config = _config(["occlusion"])
@@ -159,7 +152,7 @@ def test_false_alarms_are_claims_of_tags_that_lie_still_labelled_or_not(monkeypa
     scores = dataclasses.replace(config.scores, moved_for_s=0.0, min_pixels=2)
     _score(systems, "tagview", item, recording, scores, tally)
     assert np.mean(np.concatenate(tally.still)) == pytest.approx(3 / num)
-    assert tally.scores.result()["false_claims"] == pytest.approx((3 + num) / (2 * num))
+    assert tally.scores.result()["false_detections"] == pytest.approx((3 + num) / (2 * num))
 
 
 def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -19,19 +19,22 @@ from omegaconf import OmegaConf
 
 from experiments.suites import suites_named
 from tagjax.baselines.tagview import MatchSettings
-from tagjax.build import build
-from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, TrainFlowConfig, from_mapping
+from tagjax.core.build import build
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import SystemSettings
-from tagjax.evaluation.evaluate import ScoreSettings
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
+from tagjax.evaluation.run import EvaluateConfig
 from tagjax.evaluation.sweep import SweepConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
+from tagjax.metrics.recordings import ScoreSettings
 from tagjax.sim.suites import PLANAR, Suite
 from tagjax.tagattention import TagAttention
-from tagjax.tracer import AbstractTracer
-from tagjax.tracer_settings import make_tracer, tracer_clips
+from tagjax.tagattention.tracer_settings import make_tracer, tracer_clips
+from tagjax.tracing.tracer import AbstractTracer
+from tagjax.training.config import TrainConfig
+from tagjax.training.flow_config import TrainFlowConfig
 
 GROUPS = ("data", "tracer", "optimizer", "objective", "joint", "logger", "scores", "experiment", "debug")
 OPTUNA = any("optuna" in plugin.__module__ for plugin in Plugins.instance().discover(Sweeper))  # of the sweep extra
@@ -55,7 +58,7 @@ def test_every_training_configuration_is_valid(override: str) -> None:
 
 @pytest.mark.parametrize("experiment", ["handheld", "handheld_from_people"])
 def test_hand_held_objects_are_learned_on_every_second_pixel(experiment: str) -> None:
-    config = settings(TrainConfig, "train", f"experiment={experiment}", "data=default")
+    config = settings(TrainConfig, "train", f"experiment={experiment}")
     assert config.data.clips.stride == tracer_clips(composed("train", "tracer=tagattention_handheld")["tracer"]).stride
     assert (config.scores.moved_for_s, config.scores.lock_frames) == (0.0, 10)
 

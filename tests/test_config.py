@@ -12,17 +12,22 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax import config
-from tagjax.config import ConfigError, DataSettings, EvaluateConfig, TrainConfig, build, changed, from_mapping
-from tagjax.evaluation.benchmark import BenchmarkSettings
-from tagjax.evaluation.evaluate import ScoreSettings
+from tagjax.benchmarks.stages import BenchmarkSettings
+from tagjax.core.build import build
+from tagjax.core.settings import ConfigError, changed, from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
+from tagjax.evaluation.run import EvaluateConfig
 from tagjax.flow.losses import FlowLossSettings
+from tagjax.metrics.recordings import ScoreSettings
+from tagjax.recording.opening import VirtualTagSettings
+from tagjax.tracing.clips import ClipSettings
+from tagjax.training.config import TrainConfig
 from tagjax.training.flow_sources import FlowDataSettings
 from tagjax.training.logging import LoggerSettings
 from tagjax.training.loop import LoopSettings
 from tagjax.training.loss import ObjectiveSettings
 from tagjax.training.processes import DistributedSettings
+from tagjax.training.sources import DataSettings
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -88,8 +93,8 @@ def test_build_makes_what_the_target_names() -> None:
     assert isinstance(build({"_target_": "optax.adam", "learning_rate": 0.1}), optax.GradientTransformation)
     nested = {"_target_": "optax.sgd", "learning_rate": {"_target_": "optax.constant_schedule", "value": 0.2}}
     assert isinstance(build(nested), optax.GradientTransformation)
-    resting = build({"_target_": "tagjax.config.ClipSettings", "stride": 2})
-    assert resting == config.ClipSettings(stride=2)
+    resting = build({"_target_": "tagjax.tracing.clips.ClipSettings", "stride": 2})
+    assert resting == ClipSettings(stride=2)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +104,7 @@ def test_build_makes_what_the_target_names() -> None:
         ("tagjaxevil.thing", "starts with tagjax. or optax."),
         ("tagjax.recording.dataclasses.asdict", "can be called"),
         ("tagjax.training.logging.os.system", "can be called"),
-        ("tagjax.build._resolve", "can be called"),
+        ("tagjax.core.build._resolve", "can be called"),
         ("optax.adamm", "can be called"),
         ("tagjax.nothing.here", "can be called"),
         (None, "found None"),
@@ -139,7 +144,7 @@ def _composed(command: str, *overrides: str) -> Any:
 @pytest.mark.parametrize(
     ("command", "overrides", "path", "schema", "changes"),
     [
-        ("train", ["data=default"], "data", DataSettings, {}),
+        ("train", [], "data", DataSettings, {"clips"}),
         ("train", [], "objective", ObjectiveSettings, {}),
         ("train", [], "scores", ScoreSettings, {}),
         ("train", [], "loop", LoopSettings, {}),
@@ -148,7 +153,7 @@ def _composed(command: str, *overrides: str) -> Any:
         ("train_flow", [], "distributed", DistributedSettings, {}),
         ("train_flow", [], "data", FlowDataSettings, {"drawn"}),
         ("train_flow", [], "loss", FlowLossSettings, {"smooth_first"}),
-        ("evaluate", [], "virtual_tag", config.VirtualTagSettings, {}),
+        ("evaluate", [], "virtual_tag", VirtualTagSettings, {}),
         ("evaluate_flow", [], "", FlowEvaluationSettings, {"pairs"}),
         ("benchmark", [], "", BenchmarkSettings, {}),
     ],
@@ -172,12 +177,12 @@ def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
     names = {field.name for field in dataclasses.fields(EvaluateConfig)}
     given = {name: value for name, value in values.items() if name in names}
     assert from_mapping(EvaluateConfig, {**given, "clips": {}, "scores": {}}) == EvaluateConfig()
-    for name, settings in (("clips", config.ClipSettings()), ("scores", ScoreSettings())):
+    for name, settings in (("clips", ClipSettings()), ("scores", ScoreSettings())):
         assert changed(settings, values[name], where=name) == settings
     assert set(values["scores"]) == {field.name for field in dataclasses.fields(ScoreSettings)}
     # Of a training clip only: its length, motion, tags and workers. The tags of an evaluation are the key `epcs`.
     of_training = {"length", "epcs", "min_motion", "max_tags", "workers"}
-    assert set(values["clips"]) == {field.name for field in dataclasses.fields(config.ClipSettings)} - of_training
+    assert set(values["clips"]) == {field.name for field in dataclasses.fields(ClipSettings)} - of_training
 
 
 def test_an_unknown_key_comes_with_the_closest_known_one() -> None:

@@ -14,10 +14,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override
 from omegaconf import OmegaConf
 
-from tagjax.config import EvaluateConfig, SimulateConfig, TrainConfig, TrainFlowConfig, from_mapping
+from tagjax.core.settings import from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
+from tagjax.evaluation.run import EvaluateConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
+from tagjax.sim.suites import SimulateConfig
+from tagjax.training.config import TrainConfig
+from tagjax.training.flow_config import TrainFlowConfig
 
 ROOT = Path(__file__).parents[1]
 SCHEMAS: dict[str, type] = {

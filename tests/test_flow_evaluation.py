@@ -14,17 +14,17 @@ import synthetic_clips as synthetic
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax.config import ConfigError, from_mapping
-from tagjax.data.flo import read_flo, write_flo
-from tagjax.data.store import save_recording
+from tagjax.benchmarks.flow_speed import moved_pictures
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings, evaluate_flows, flow_tables
 from tagjax.evaluation.flow_cases import drawn_material, folder_material, recording_material, sequence_material
-from tagjax.evaluation.flow_metrics import FlowScores, endpoint_error, warped_error
-from tagjax.evaluation.flow_speed import moved_pictures
+from tagjax.flow.flo_files import read_flo, write_flo
 from tagjax.flow.named import make_flow
+from tagjax.metrics.flow import FlowScores, endpoint_error, warped_error
 from tagjax.recording import RecordingError, Truth
+from tagjax.recording.store import save_recording
+from tagjax.report.flow import colour_wheel, error_colours, flow_colours
 from tagjax.sim.flow_pairs import FlowPairSettings
-from tagjax.viz.flow import colour_wheel, error_colours, flow_colours
 
 CONF = Path(__file__).parents[1] / "conf"
 SMALL = FlowPairSettings(height=32, width=48, num_layers=(1, 2), radius_px=(4.0, 12.0))

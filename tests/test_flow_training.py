@@ -17,26 +17,19 @@ import optax
 import pytest
 from jaxtyping import Array, Float
 
-from tagjax.config import ConfigError, TrainFlowConfig, from_mapping
-from tagjax.data.picture_pairs import (
-    ImageFolder,
-    PairSource,
-    StackedPairs,
-    VariationSettings,
-    open_sequence,
-    pair_dataset,
-    vary,
-)
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.flow.estimates import NetworkFlow
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.named import make_flow
 from tagjax.flow.network import AbstractFlowNetwork
+from tagjax.flow.picture_pairs import ImageFolder, PairSource, StackedPairs, VariationSettings, open_sequence, pair_dataset, vary
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
 from tagjax.recording import RecordingError
 from tagjax.sim.flow_pairs import FlowPair, FlowPairSettings
 from tagjax.training import flow_sources
 from tagjax.training.checkpoint import Checkpoints
+from tagjax.training.flow_config import TrainFlowConfig
 from tagjax.training.flow_run import flow_of, flow_of_peer, run_flow_training, scores
 from tagjax.training.flow_sources import DrawnSettings, drawn_pairs, flow_dataset, validation_pairs
 from tagjax.training.flow_step import FlowTrainState, batch_loss, flow_step

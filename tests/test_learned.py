@@ -14,11 +14,11 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax import learned
-from tagjax.config import ClipSettings, ConfigError
-from tagjax.learned import load_parameters, packaged_parameters, read_learned, save_parameters
-from tagjax.tagattention import TagAttention
-from tagjax.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from tagjax.core.settings import ConfigError
+from tagjax.tagattention import TagAttention, learned
+from tagjax.tagattention.learned import load_parameters, packaged_parameters, read_learned, save_parameters
+from tagjax.tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from tagjax.tracing.clips import ClipSettings
 
 CONF = str((Path(__file__).parents[1] / "conf").resolve())
 SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
@@ -129,7 +129,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
 def test_a_tracer_without_learned_parameters_says_so() -> None:
     with pytest.raises(ValueError, match="learned parameters are of TagAttention"):
-        make_tracer({"_target_": "tagjax.tagattention_paper.TagAttentionPaper"}, "default")
+        make_tracer({"_target_": "tagjax.tagattention.paper.TagAttentionPaper"}, "default")
 
 
 def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:

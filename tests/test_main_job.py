@@ -16,16 +16,19 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, VirtualTagSettings, from_mapping
-from tagjax.data.store import save_recording
-from tagjax.evaluation.run import run_evaluation
+from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.evaluation.run import EvaluateConfig, run_evaluation
 from tagjax.recording import RecordingError, TagReads
+from tagjax.recording.opening import VirtualTagSettings, with_virtual_tags
+from tagjax.recording.reads import join_reads
+from tagjax.recording.store import save_recording
 from tagjax.tagattention import TagAttention
-from tagjax.tagattention_paper import TagAttentionPaper
+from tagjax.tagattention.paper import TagAttentionPaper
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.training import run as run_module
+from tagjax.training.config import TrainConfig
 from tagjax.training.loop import Trained
-from tagjax.training.run import antennas_for, make_tracer, run_training
-from tagjax.training.sources import join_reads, with_virtual_tags
+from tagjax.training.run import antennas_for, run_training
 from tagjax.training.state import TrainState
 
 ROOT = Path(__file__).parents[1]
@@ -46,9 +49,9 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def _values(recordings: list[str]) -> dict:
     return {
         # Softened, the paper's tracer has parameters to learn, too; with it the test takes half as long.
-        "tracer": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
+        "tracer": {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},
-        "baselines": {"paper": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4}},
+        "baselines": {"paper": {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4}},
         "data": {
             "recordings": recordings[:1],
             "validation": recordings[1:],

@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import ConfigError, from_mapping
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.sweep import Line, SweepConfig, point_name, read_lines, run_sweep, table, write_sweep
 from tagjax.tagattention import TagAttention
-from tagjax.tracer_settings import make_tracer
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.training.logging import Logger, LoggerSettings
 
 ROOT = Path(__file__).parents[1]
@@ -246,7 +246,7 @@ SUITE = {
     "counts": {"train": 0, "validation": 0, "test": 1},
     "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
 }
-PAPER = {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
+PAPER = {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
 
 
 def _config(folder: Path, **settings) -> SweepConfig:

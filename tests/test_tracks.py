@@ -13,35 +13,13 @@ import numpy as np
 import pytest
 import yaml
 
-from tagjax.attention import coherent_score
-from tagjax.config import from_mapping
-from tagjax.evaluation.real_tags import (
-    SCORES,
-    align,
-    associate,
-    heard_speed,
-    places_around,
-    speed_scores,
-    speed_windows,
-)
-from tagjax.evaluation.tagged_walks import Speeds, Walk, load_tagged, load_uwb
-from tagjax.evaluation.tracks import (
-    METHODS,
-    Scene,
-    TracksConfig,
-    antenna_place,
-    association_scores,
-    load_kinect,
-    load_scenes,
-    load_xovis,
-    real_tags_markdown,
-    right,
-    run_real_tags,
-    run_tracks,
-    windows,
-)
+from tagjax.core.settings import from_mapping
+from tagjax.evaluation.real_tags import SCORES, align, associate, heard_speed, places_around, speed_scores, speed_windows
+from tagjax.evaluation.tracks import METHODS, Scene, TracksConfig, antenna_place, association_scores, load_kinect, load_scenes, load_xovis, real_tags_markdown, right, run_real_tags, run_tracks, windows
 from tagjax.recording import RecordingError
-from tagjax.rf.windows import phase_reads
+from tagjax.recording.importers.tagged_walks import Speeds, Walk, load_tagged, load_uwb
+from tagjax.tagattention.attention import coherent_score
+from tagjax.tracing.range_windows import phase_reads
 
 RATE_HZ = 15.0
 

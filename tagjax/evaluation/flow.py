@@ -16,14 +16,14 @@ from rich.box import SIMPLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from ..core.machine import machine
 from ..flow.named import flow_key, make_flow, taken_apart
 from ..flow.opencv import FlowFunction
+from ..metrics.flow import FlowScores, endpoint_error, warped_error
+from ..report.flow import flow_panel
+from ..report.report import write_json
 from ..sim.flow_pairs import FlowPairSettings
-from ..viz.flow import flow_panel
-from .benchmark import machine
 from .flow_cases import FlowCase, Material, drawn_material, folder_material, recording_material, sequence_material
-from .flow_metrics import FlowScores, endpoint_error, warped_error
-from .report import write_json
 
 _COLUMNS = {
     "epe_px": "EPE px",

@@ -19,8 +19,8 @@ import scipy.ndimage
 import scipy.optimize
 from jaxtyping import Array, Float
 
-from ..attention import att_corr
-from .tagged_walks import LEAST_READS, SMOOTH_S, Speeds, TaggedRecording, Walk
+from ..recording.importers.tagged_walks import LEAST_READS, SMOOTH_S, Speeds, TaggedRecording, Walk
+from ..tagattention.attention import att_corr
 
 SCORES = ("TagAttention, Eq. 5", "Tagview, R^2", "correlation of speeds")
 """Those that ask for no scale: correlation of relative distances over k frames, and of distances and of speeds over the window.

@@ -7,14 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..config import ClipSettings, ConfigError, DataSettings, EvaluateConfig, TrainConfig, changed, from_mapping
+from ..core.settings import ConfigError, changed, from_mapping
+from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
-from ..tracer_settings import learned_tracer, make_tracer, tracer_clips
+from ..recording.opening import VirtualTagSettings, opened
+from ..tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from ..tracing.clips import ClipSettings
 from ..training.checkpoint import Checkpoints
+from ..training.config import TrainConfig
 from ..training.run import evaluate_tracers, initial_state, own_flow
-from ..training.sources import opened, training_recordings
+from ..training.sources import DataSettings, training_recordings
 from ..training.state import TrainState
-from .evaluate import ScoreSettings
 
 
 def restore_state(run: Path, config: TrainConfig, *, step: int | None = None) -> TrainState:
@@ -88,3 +91,39 @@ def run_evaluation(
         frames=config.frames,
         progress=config.progress,
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateConfig:
+    """All settings of an evaluation. What is None is taken from the run, the weights, or the tracer's configuration."""
+
+    run: str | None = None  # a run folder of experiments.train
+    checkpoint: int | None = None  # step; the newest if None
+    tracer: Mapping[str, Any] | None = None
+    weights: str | None = (
+        None  # learned parameters: `default`, a name, or a file; they name their tracer if `tracer` is None
+    )
+    recordings: tuple[str, ...] = ()
+    epcs: tuple[str, ...] | None = None
+    frames: tuple[int, int] | None = None
+    clips: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # in place of the run's, the weights' or the tracer's
+    baselines: Mapping[str, Mapping[str, Any]] | None = None
+    baseline_estimators: Mapping[str, str] | None = None
+    virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        changed(ClipSettings(), self.clips, where="clips")
+        changed(ScoreSettings(), self.scores, where="scores")
+        for name, other in (("tracer", self.tracer), ("weights", self.weights)):
+            if self.run is not None and other is not None:
+                raise ConfigError(
+                    f"found both run={self.run} and {name}=; expected one of them, because a run has its own tracer and parameters."
+                )
+        if self.run is None and self.checkpoint is not None:
+            raise ConfigError(
+                f"found checkpoint={self.checkpoint} without run; expected run=<folder of experiments.train> with it."
+            )

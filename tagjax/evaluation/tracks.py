@@ -17,18 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from ..attention import att_corr, att_rbf, attention, coherent_score
 from ..baselines.tagview import ReadSettings, fit_pairs, hear
 from ..baselines.tagvision import Snapshots, match_scores
+from ..radio.channels import estimate_slope
+from ..radio.reader import ReaderSettings
 from ..recording import RecordingError, TagReads
-from ..rf.channels import estimate_slope
-from ..rf.windows import phase_reads, radio_windows
-from ..sim.reader import ReaderSettings
-from ..sim.virtual_tag import Track, virtual_reads
-from ..viz.tracks import accuracy_plot, speeds_plot
+from ..recording.importers.tagged_walks import load_tagged, load_uwb, read_kinect, read_xovis
+from ..recording.virtual_tags import Track, virtual_reads
+from ..report.report import write_json
+from ..tagattention.attention import att_corr, att_rbf, attention, coherent_score
+from ..tracing.range_windows import phase_reads, radio_windows
 from .real_tags import SCORES, associate, speed_scores, speed_windows
-from .report import write_json
-from .tagged_walks import load_tagged, load_uwb, read_kinect, read_xovis
+from .tracks_figures import accuracy_plot, speeds_plot
 
 METHODS = (
     "TagAttention, coherent",
@@ -158,7 +158,7 @@ def windows(scene: Scene, length_s: float, config: TracksConfig) -> list[Window]
     antenna, found = antenna_place(scene), []
     three = lambda place: np.concatenate([place, np.zeros((*place.shape[:-1], 1))], axis=-1)  # noqa: E731
     num = round(length_s * config.frame_rate_hz)
-    settings = ReaderSettings(region=config.region, flip_share=config.flip_share)
+    settings = ReaderSettings(region=config.region, flip_probability=config.flip_share)
     true_m = np.linalg.norm(three(scene.position_m) - antenna, axis=-1)
     noisy = scene.position_m + config.noise_m * rng.normal(size=scene.position_m.shape)
     seen_m = np.linalg.norm(three(noisy) - antenna, axis=-1)

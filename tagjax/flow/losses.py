@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._numerics import safe_sqrt
+from ..core.numerics import safe_sqrt
 from ..image.census import census_distance, census_offsets, to_grey
 from ..image.warp import gather, pixel_grid
 from ._layers import enlarge_flow, shrink

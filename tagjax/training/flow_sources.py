@@ -14,19 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
-from .._types import LazyArray
-from ..data.picture_pairs import (
-    PairSource,
-    StackedPairs,
-    TaughtPairs,
-    VariationSettings,
-    open_sequence,
-    pair_dataset,
-)
-from ..data.prepared import made_once, write_rows
-from ..data.stream import Stream
+from ..core.prepared import made_once, write_rows
+from ..core.stream import Stream
+from ..core.types import LazyArray
+from ..flow.picture_pairs import PairSource, StackedPairs, TaughtPairs, VariationSettings, open_sequence, pair_dataset
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
-from ..sim.textures import PHOTOGRAPHS, photograph
+from ..sim.rendering.textures import PHOTOGRAPHS, photograph
 from .flow_teacher import cut_pairs, taught_flow
 
 _BATCH = 16

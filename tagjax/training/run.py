@@ -13,22 +13,25 @@ import optax
 from rich.console import Console
 from rich.progress import track
 
-from ..config import ClipSettings, ConfigError, TrainConfig, build
-from ..data.clips import Antennas, Clip, clip_dataset
-from ..evaluation.evaluate import RecordingResult, ScoreSettings, evaluate_recording
-from ..evaluation.report import plain, score_table, write_json, write_report
-from ..learned import save_parameters
+from ..core.build import build
+from ..core.settings import ConfigError
+from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
+from ..report.report import plain, score_table, write_json, write_report
 from ..tagattention import TagAttention
-from ..tracer import AbstractTracer
-from ..tracer_settings import make_tracer as make_tracer
+from ..tagattention.learned import save_parameters
+from ..tagattention.tracer_settings import make_tracer
+from ..tracing.clips import Antennas, Clip, ClipSettings, clip_loader
+from ..tracing.tracer import AbstractTracer
 from .checkpoint import Checkpoints
+from .clip_dataset import clip_dataset
+from .config import TrainConfig
 from .flow_run import initial_network
 from .joint import JointModel, save_network
 from .logging import Logger
 from .loop import Trained, resumed, train
 from .processes import is_first, joined, share_of
-from .sources import clip_loader, training_recordings
+from .sources import training_recordings
 from .state import TrainState
 from .step import clip_loss, make_joint_optimizer, make_optimizer, train_step
 
@@ -238,7 +241,7 @@ def held_out_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list
 
 def smoothed(tracers: Mapping[str, AbstractTracer], settings: ScoreSettings) -> set[str]:
     """Names of the tracers that go backwards first: with `settings.smooth` all that can. Raises `ConfigError` if none can."""
-    names = {name for name, tracer in tracers.items() if settings.able(tracer).smooth}
+    names = {name for name, tracer in tracers.items() if settings.supported_by(tracer).smooth}
     if settings.smooth and not names:
         kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
         raise ConfigError(f"scores.smooth: {kinds} goes forwards only; expected TagAttention. Set scores.smooth=false.")
@@ -295,7 +298,7 @@ def evaluate_tracers(
                 loaders[name],
                 stride=clips.stride,
                 epcs=epcs,
-                settings=settings.able(tracers[name]),
+                settings=settings.supported_by(tracers[name]),
                 frames=frames,
             )
         )

@@ -13,15 +13,15 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
-from ...config import ConfigError, from_mapping
-from ...data.store import open_recording
+from ...core.settings import ConfigError, from_mapping
+from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
+from ...metrics.tracking import Scores
 from ...recording import Recording, RecordingError
+from ...recording.store import open_recording
+from ...report.comparison import bar_plot
+from ...report.report import write_json
 from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_items
-from ...tracer import Trace
-from ...viz.comparison import bar_plot
-from ..evaluate import RecordingResult, ScoreSettings, score_traces
-from ..metrics import Scores
-from ..report import write_json
+from ...tracing.tracer import Trace
 from ._systems import NAMES, Systems, SystemSettings
 from ._table import LEGEND, MEASURES, SHORT, Cell, bars, markdown, said, write_csv
 
@@ -102,7 +102,7 @@ def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> 
         suite,
         Path(config.recordings_dir),
         splits=(config.split,),
-        most=config.max_recordings,
+        max_per_variant=config.max_recordings,
         workers=config.workers,
         on_done=lambda one: tell(f"simulated {one.name}"),
     )
@@ -143,7 +143,7 @@ def _cell(
         told.get("iou"),
         told.get("cle_px"),
         float(np.median(error_m)) * 1e3 if len(error_m) else None,
-        told.get("found"),
+        told.get("detected"),
         float(np.mean(still)) if len(still) else None,
         float(np.median(tally.pace_ms)),
         settings=", ".join(ways) or None,
@@ -181,7 +181,7 @@ def _tally_places(result: RecordingResult, epcs: Sequence[str], claims: Sequence
         frames = result.frames.get(epc)
         if frames is not None:
             gap = np.linalg.norm(place_m[:, tag] - true_m, axis=-1)
-            tally.error_m.append(gap[frames.valid & frames.found])
+            tally.error_m.append(gap[frames.valid & frames.detected])
 
 
 def _watched(
@@ -194,7 +194,7 @@ def _watched(
         if found is None:
             return
         elapsed_s.append(time.perf_counter() - begun)
-        claims.append((np.asarray(found[1].centre_m, np.float64), np.asarray(found[1].found, bool)))
+        claims.append((np.asarray(found[1].centre_m, np.float64), np.asarray(found[1].detected, bool)))
         yield found
 
 

@@ -11,14 +11,15 @@ from ...baselines._interface import host_trace
 from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate, load_calibration
 from ...baselines.tagview import TagviewSettings, TagviewTracer
 from ...baselines.tagvision import PlaneCamera, TagVision, TagVisionSettings
-from ...config import ConfigError
-from ...data.store import open_recording
+from ...core.settings import ConfigError
+from ...metrics.recordings import ScoreSettings
 from ...recording import Recording, RecordingError
+from ...recording.store import open_recording
 from ...sim.suites import Item
-from ...tracer import AbstractTracer, Trace
-from ...tracer_settings import make_tracer, tracer_clips
-from ...training.sources import clip_loader
-from ..evaluate import ScoreSettings, trace_recording
+from ...tagattention.tracer_settings import make_tracer, tracer_clips
+from ...tracing.clips import clip_loader
+from ...tracing.recordings import trace_recording
+from ...tracing.tracer import AbstractTracer, Trace
 from ..tagvision import CalibrationSettings, calibrated, table_truth
 
 Traces = Iterator[tuple[int, Trace]]
@@ -124,7 +125,9 @@ class Systems:
         if key not in self._tracers:
             self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings)
         tracer = self._tracers[key]
-        return trace_recording(tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.able(tracer))
+        return trace_recording(
+            tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.supported_by(tracer)
+        )
 
     def _plane(self, item: Item, recording: Recording) -> PlaneCamera:
         """The camera as it was calibrated on the table, which both TagVision and Tagview take."""

@@ -28,8 +28,8 @@ from ...baselines.goller import (
     true_states,
 )
 from ...recording import Recording
+from ...report.report import write_json
 from ...sim.suites import SPLITS
-from ..report import write_json
 from ._figures import antenna_plot, association_plot, handover_plot, roc_plot, scene_picture
 from ._handover import Handover, follow
 from ._ladder import ladder

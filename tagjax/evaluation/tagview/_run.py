@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ..._numerics import SPEED_OF_LIGHT_M_S
 from ...baselines.tagview import (
     BoxDetector,
     MatchSettings,
@@ -23,9 +22,10 @@ from ...baselines.tagview import (
     save_detector,
     train_detector,
 )
-from ...data.store import open_recording
+from ...core.numerics import SPEED_OF_LIGHT_M_S
 from ...recording import Recording
-from ..report import write_json
+from ...recording.store import open_recording
+from ...report.report import write_json
 from ._figures import accuracy_plot, pair_plot, track_plot
 from ._judge import Judged, Watched, judge, watch
 from ._table import PAPER_GROUPS, quartiles, summarise, table

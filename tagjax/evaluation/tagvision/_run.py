@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from ...baselines.tagvision import MatchSettings, TagVisionSettings
-from ...config import ConfigError, from_mapping
-from ...data.store import open_recording
+from ...baselines.tagvision.figures import error_plot, line_plot, matching_plot
+from ...core.settings import ConfigError, from_mapping
+from ...recording.store import open_recording
+from ...report.report import write_json
 from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_suite
-from ...viz.tagvision import error_plot, line_plot, matching_plot
-from ..report import write_json
 from ._calibration import PAPER_CAMERA, CalibrationSettings, calibrated, overhead, transform_error_m
 from ._lines import LineScores, LineSettings, line_scores
 from ._table import TagResult, judge, see, table_truth

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..._numerics import safe_divide
-from ...rf.coherence import coherence, phase_likelihood, phase_residual
-from ...rf.reads import PhaseReads
+from ...core.numerics import safe_divide
+from ...radio.coherence import coherence, phase_likelihood, phase_residual
+from ...radio.reads import PhaseReads
 from ._seen import ObjectiveSettings, Seen
 
 

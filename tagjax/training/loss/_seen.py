@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ...rf.reads import PhaseReads
-from ...tracer import AbstractTracer, Camera, Frame, Trace, trace
+from ...radio.reads import PhaseReads
+from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace, trace
 
 TERM_NAMES = ("contrast", "coverage", "area", "compactness", "steadiness", "calibration")
 """The terms of the objective, each with its weight among the settings."""
