@@ -190,7 +190,7 @@ def test_recordings_lie_in_one_place() -> None:
         if path != CONF / "paths" / "default.yaml":
             assert not re.search(r"^[^#\n]*: *(recordings|outputs)(/|\s|$)", path.read_text(), re.MULTILINE), path
     assert composed("simulate", "paths.recordings_dir=elsewhere")["recordings_dir"] == "elsewhere"
-    assert composed("train", "paths.recordings_dir=elsewhere")["data"]["simulate"]["folder"] == "elsewhere"
+    assert composed("train", "paths.recordings_dir=elsewhere")["recordings_dir"] == "elsewhere"
     assert composed("goller", "paths.recordings_dir=elsewhere")["scenarios"] == "elsewhere/shop_exit"
 
 

@@ -138,7 +138,7 @@ def test_noise_of_a_track_costs_the_doubled_angle_more_than_flips_cost_the_plain
     walks = np.stack([3.0 + 1.0 * np.sin(2 * np.pi * time_s / 6.0), np.zeros(len(time_s))], axis=-1)
     still = np.broadcast_to([4.0, 1.0], walks.shape)
     scene = Scene("walk", time_s, np.stack([walks, still]))
-    config = TracksConfig("x", noise_m=0.02, region="fixed", flip_share=0.08, max_windows=3)
+    config = TracksConfig("x", noise_m=0.02, region="fixed", flip_probability=0.08, max_windows=3)
     seen = [window for window in windows(scene, 4.0, config) if window.carrier == 0]
     scores = []
     for one in seen:
@@ -164,7 +164,7 @@ def test_the_configuration_names_every_setting():
 def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path):
     """Without noise, flips or hops a window of 4 s suffices for all of them; a run writes what it found."""
     config = TracksConfig(
-        str(folder), windows_s=(4.0,), frame_rate_hz=RATE_HZ, max_windows=6, noise_m=0.0, flip_share=0.0, region="fixed"
+        str(folder), windows_s=(4.0,), frame_rate_hz=RATE_HZ, max_windows=6, noise_m=0.0, flip_probability=0.0, region="fixed"
     )
     rows = run_tracks(config, tmp_path, on_done=lambda name: None)["rows"]
     assert [row["scene"] for row in rows] == ["kinect-rfid", "xovis-uwb"]
