@@ -21,7 +21,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
     from tagjax.core.settings import from_mapping
-    from tagjax.sim.contact_sheet import save_glance, save_sheet
+    from tagjax.sim.contact_sheet import save_preview, save_sheet
     from tagjax.sim.suites import SimulateConfig, Suite, make_suite
 
     from .progress import counting_bar
@@ -33,7 +33,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     suite = suite.smoke() if config.smoke else suite
     recordings_dir, console = Path(config.recordings_dir), Console()
     if config.sheet is not None:
-        console.print(f"{suite.name}: {save_glance(suite, Path(config.sheet), workers=config.workers or 1)}")
+        console.print(f"{suite.name}: {save_preview(suite, Path(config.sheet), workers=config.workers or 1)}")
         return
     items = suite.items()
     with counting_bar(console, shown=config.progress) as bar:
