@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fminbound, minimize
 
-from tagjax.radio.noise import pi_flip_share
+from tagjax.radio.noise import estimate_flip_probability
 from tagjax.radio.reader import HOP_TABLES_HZ, ReaderState
 from tagjax.recording.importers.clock import audit_clocks
 from tagjax.recording.virtual_tags import Track
@@ -449,7 +449,7 @@ def test_pi_flips_come_at_their_share(share):
     """0.06 to 0.12 of the reads give the 11 to 21 % of transitions that logs show (rfid-facts 1.4)."""
     settings = dataclasses.replace(PLAIN, flip_share=share)
     reads = simulate_inventory(still([[0.0, 0.0, 1.0]], 120.0), AT_ORIGIN, free_space(), settings, seed=0).reads
-    assert abs(pi_flip_share(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index) - share) < 0.012
+    assert abs(estimate_flip_probability(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index) - share) < 0.012
     assert reads.pi_flips == (share > 0)
 
 

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from tagjax.core.settings import ConfigError, build, changed, from_mapping
 from tagjax.evaluation.run import EvaluateConfig
 from tagjax.metrics.recordings import ScoreSettings
-from tagjax.recording.opening import VirtualTagSettings
+from tagjax.recording.loading import VirtualTagSettings
 from tagjax.tracing.clips import ClipSettings
 from tagjax.training.config import TrainConfig
 from tagjax.training.loop import LoopSettings

@@ -15,19 +15,19 @@ from tagjax.flow._layers import enlarge_flow
 from tagjax.flow.losses import (
     FlowLossSettings,
     charbonnier,
+    consistency_error_px2,
+    crop_margin_px,
     data_distance,
     data_term,
-    imitation_term,
-    inconsistency,
+    distillation_term,
     inside,
     level_terms,
-    margin_of,
     occluded,
+    self_supervision_term,
     sequence_terms,
     shown,
     smoothness,
     ssim_distance,
-    teaching_term,
     weighted,
 )
 from tagjax.image.census import GREY, census_distance, census_offsets, ternary, to_grey
@@ -254,10 +254,10 @@ def test_a_margin_of_nothing_is_no_margin():
 
 
 def test_margins_that_are_not_alike_are_refused():
-    assert margin_of((20, 30), (26, 36)) == 3
+    assert crop_margin_px((20, 30), (26, 36)) == 3
     for whole in ((26, 34), (25, 35), (18, 28)):
         with pytest.raises(ValueError, match="equally far"):
-            margin_of((20, 30), whole)
+            crop_margin_px((20, 30), whole)
 
 
 # Occlusion
@@ -278,7 +278,7 @@ def test_occluded_is_what_the_square_covers():
     uncovered = np.zeros((24, 40), bool)
     uncovered[7:17, 8:14] = True
     np.testing.assert_array_equal(occluded(jnp.asarray(backward), jnp.asarray(forward)), uncovered)
-    gap, length = inconsistency(jnp.asarray(forward), jnp.asarray(backward))
+    gap, length = consistency_error_px2(jnp.asarray(forward), jnp.asarray(backward))
     np.testing.assert_allclose(gap, 36.0 * covered, atol=1e-5)
     np.testing.assert_allclose(length, 36.0 * covered + 72.0 * (forward[..., 0] > 0), atol=1e-5)
 
@@ -340,10 +340,10 @@ def test_teaching_is_the_mean_gap_where_only_the_teacher_is_sure():
     student_hidden = jnp.zeros((6, 8), bool).at[1:4, 2:6].set(True)
     # 12 pixels that the student cannot see, less the one that the teacher cannot either; a gap of 1.5 and 2.
     expected = 11 * (1.5 + 2.0) / 48
-    found = teaching_term(student, teacher, student_hidden, teacher_hidden, 2)
+    found = self_supervision_term(student, teacher, student_hidden, teacher_hidden, 2)
     assert float(found) == pytest.approx(expected, rel=1e-5)
     nobody = jnp.zeros((6, 8), bool)
-    assert float(teaching_term(student, teacher, nobody, teacher_hidden, 2)) == 0
+    assert float(self_supervision_term(student, teacher, nobody, teacher_hidden, 2)) == 0
 
 
 def test_teaching_gradient_reaches_the_student_only(gradients_agree):
@@ -352,7 +352,7 @@ def test_teaching_gradient_reaches_the_student_only(gradients_agree):
     teacher, student = _uneven(7, 8), _uneven(3, 4, seed=3)
 
     def term(student, teacher):
-        return teaching_term(student, teacher, jnp.asarray(student_hidden), jnp.asarray(teacher_hidden), 2)
+        return self_supervision_term(student, teacher, jnp.asarray(student_hidden), jnp.asarray(teacher_hidden), 2)
 
     gradients_agree(lambda s: term(s, jnp.asarray(teacher, s.dtype)), (student,))
     to_teacher = jax.grad(term, argnums=1)(jnp.asarray(student), jnp.asarray(teacher))
@@ -365,7 +365,7 @@ def test_teaching_gradient_reaches_the_student_only(gradients_agree):
 
 
 def _imitated(levels, teacher, **changes):
-    return imitation_term(levels, teacher, dataclasses.replace(SETTINGS, **changes))
+    return distillation_term(levels, teacher, dataclasses.replace(SETTINGS, **changes))
 
 
 def test_imitation_is_the_weighted_robust_distance_from_the_teachers_flow():
@@ -446,7 +446,7 @@ def test_the_terms_are_summed_over_levels_by_their_weights():
         expected += weight * float((distance * visible).sum() / visible.sum())
     assert float(found["data"]) == pytest.approx(expected, rel=1e-4)
     assert float(found["smooth_first"]) == pytest.approx(float(smoothness(forward[1], jnp.asarray(small[0]), 50.0, 1)))
-    assert float(found["hidden_share"]) == pytest.approx(
+    assert float(found["occluded_fraction"]) == pytest.approx(
         1 - float(shown(forward[2], backward[2], jnp.ones(()), SETTINGS).mean())
     )
     total = weighted({**found, "teaching": jnp.asarray(2.0)}, SETTINGS)

@@ -20,19 +20,19 @@ from jaxtyping import Array, Float
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.flow.estimates import NetworkFlow
 from tagjax.flow.losses import FlowLossSettings
-from tagjax.flow.named import make_flow
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.flow.picture_pairs import (
+    AugmentationSettings,
     ImageFolder,
     PairSource,
     StackedPairs,
-    VariationSettings,
     open_sequence,
     pair_dataset,
     vary,
 )
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
+from tagjax.flow.registry import make_flow
 from tagjax.recording import RecordingError
 from tagjax.sim.flow_pairs import FlowPair, FlowPairSettings
 from tagjax.training import flow_sources
@@ -49,9 +49,9 @@ SMALL = {
     "radii": [1, 1],
     "decoder_widths": [[8], [8]],
 }
-PLAIN = VariationSettings(
-    height=32, width=48, scale=(1.0, 1.0), turn_deg=0.0, gain=0.0, gamma=0.0, tint=0.0, unlike=0.0, noise=0.0,
-    grey_share=0.0,
+PLAIN = AugmentationSettings(
+    height=32, width=48, scale=(1.0, 1.0), rotation_deg=0.0, gain=0.0, gamma=0.0, tint=0.0, gain_difference=0.0, noise=0.0,
+    grey_probability=0.0,
 )  # fmt: skip
 
 
@@ -242,7 +242,7 @@ def test_without_variation_the_cut_is_a_piece_of_the_pictures() -> None:
 def test_both_pictures_are_cut_alike_and_variation_spares_the_clean_ones() -> None:
     picture = smooth_pictures(1, 100, 120)[0]
     pair = np.stack([picture, picture])
-    settings = VariationSettings(height=64, width=64)
+    settings = AugmentationSettings(height=64, width=64)
     for seed in range(4):
         found = vary(pair, np.random.default_rng(seed), settings)
         np.testing.assert_array_equal(found["clean"][0], found["clean"][1])
@@ -280,10 +280,10 @@ def test_flow_is_cut_as_the_pictures_are() -> None:
     x, y = np.meshgrid(np.linspace(-1, 1, 140), np.linspace(-1, 1, 120))
     flow = np.stack([5 + 2 * y, -3 + 2 * x], axis=-1).astype(np.float32)
     pair = np.stack([_moved(flow, second), second])
-    settings = dataclasses.replace(PLAIN, height=64, width=64, margin_px=8, scale=(0.8, 1.2), turn_deg=30.0)
+    settings = dataclasses.replace(PLAIN, height=64, width=64, margin_px=8, scale=(0.8, 1.2), rotation_deg=30.0)
     inner = slice(12, -12), slice(12, -12)
     for seed in range(6):
-        varied = dataclasses.replace(settings, transpose_share=float(seed % 2))
+        varied = dataclasses.replace(settings, transpose_probability=float(seed % 2))
         found = vary(pair, np.random.default_rng(seed), varied, flow)
         assert found["flow_px"].shape == (64, 64, 2)
         assert found["clean"].shape == (2, 80, 80, 3)
@@ -297,7 +297,7 @@ def test_flow_is_cut_as_the_pictures_are() -> None:
 
 def test_beyond_the_picture_there_is_no_flow() -> None:
     flow = np.ones((64, 64, 2), np.float32)
-    settings = dataclasses.replace(PLAIN, height=64, width=64, turn_deg=45.0)
+    settings = dataclasses.replace(PLAIN, height=64, width=64, rotation_deg=45.0)
     shares = [
         np.isnan(vary(smooth_pictures(2, 64, 64), np.random.default_rng(seed), settings, flow)["flow_px"]).mean()
         for seed in range(4)
@@ -308,12 +308,12 @@ def test_beyond_the_picture_there_is_no_flow() -> None:
 def test_negatives_and_exchanged_colours_are_those() -> None:
     pair = smooth_pictures(2, 64, 80)
     plain = vary(pair, np.random.default_rng(0), PLAIN)
-    negative = vary(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_share=1.0))
+    negative = vary(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_probability=1.0))
     np.testing.assert_array_equal(negative["clean"], plain["clean"])
     np.testing.assert_allclose(negative["seen"].astype(float), 255 - plain["seen"].astype(float), atol=1)
     orders = set()
     for seed in range(8):
-        found = vary(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_share=1.0))
+        found = vary(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_probability=1.0))
         order = [
             int(np.argmin([np.abs(found["seen"][..., n].astype(int) - found["clean"][..., k]).sum() for k in range(3)]))
             for n in range(3)
@@ -452,12 +452,12 @@ def test_a_student_learns_what_the_teacher_says() -> None:
         {"gaps": ()},
         {"gaps": (0,)},
         {"height": 8},
-        {"negative_share": 1.5},
+        {"negative_probability": 1.5},
     ],
 )
 def test_impossible_variation_is_refused(change: dict) -> None:
     with pytest.raises(ValueError, match=r"expected|too small"):
-        VariationSettings(**change)
+        AugmentationSettings(**change)
 
 
 def test_stream_of_pairs_resumes_exactly() -> None:
@@ -465,7 +465,7 @@ def test_stream_of_pairs_resumes_exactly() -> None:
         PairSource(smooth_pictures(5, 64, 80), (1,)),
         StackedPairs(smooth_pictures(6, 64, 80).reshape(3, 2, 64, 80, 3)),
     ]
-    settings = VariationSettings(height=32, width=32)
+    settings = AugmentationSettings(height=32, width=32)
     stream = iter(pair_dataset(sources, (0.5, 0.5), settings, seed=3))
     for _ in range(5):
         next(stream)
@@ -613,7 +613,7 @@ def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     pictures = jnp.asarray(np.stack([sample["clean"][:, :31] for sample in batch()]), jnp.float32) / 255
     shares = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=False)[1]["hidden_share"])
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=False)[1]["occluded_fraction"])
         for step in (4, 5)
     ]
     assert shares[0] == pytest.approx(1 / 32)  # what leaves the picture
@@ -670,7 +670,7 @@ def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> No
     assert told["warped_levels"]["dis"] < 0.5 * told["warped_levels"]["zero"]
     assert set(told["epe_px"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
     np.testing.assert_allclose(score, told["epe_px"]["learned"]["all"])
-    assert (tmp_path / "run" / "weights.npz").is_file()
+    assert (tmp_path / "run" / "weights.safetensors").is_file()
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ import synthetic_clips as synthetic
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.run import EvaluateConfig, run_evaluation
 from tagjax.recording import RecordingError, TagReads
-from tagjax.recording.opening import VirtualTagSettings, with_virtual_tags
+from tagjax.recording.loading import VirtualTagSettings, with_virtual_tags
 from tagjax.recording.reads import join_reads
 from tagjax.recording.store import save_recording
 from tagjax.tagattention import TagAttention

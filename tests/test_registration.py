@@ -11,10 +11,10 @@ import scipy.io
 
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.recording import Intrinsics, RecordingError
+from tagjax.recording.image_files import read_colour
 from tagjax.recording.importers.registration import estimate_correction, misalignment_px
 from tagjax.recording.importers.rgbd_folder import DepthToColour, load_calibration, read_mat_depth
 from tagjax.recording.importers.settings import ImportSettings, import_recording
-from tagjax.recording.picture_files import read_colour
 
 RESIDUAL = (-0.006, 0.004, 0.002, 1.004, 0.99, 8.5, -3.0)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.radio.noise import pi_flip_share
+from tagjax.radio.noise import estimate_flip_probability
 from tagjax.radio.reader import DWELL_S, ReaderSettings, ReaderState, channel_at, noise_sigma_rad, read_times
 from tagjax.recording import RecordingError
 from tagjax.recording.virtual_tags import Track, attach_virtual_tags, load_tracks_csv, virtual_reads
@@ -34,7 +34,7 @@ def test_phase_noise_follows_the_measured_table():
 
 
 def test_static_tag_repeats_its_phase_within_a_channel():
-    settings = ReaderSettings(flip_share=0.0, region="fixed")
+    settings = ReaderSettings(flip_probability=0.0, region="fixed")
     reads = virtual_reads(STILL, "A", settings, seed=0, antenna_m=np.zeros(3))
     spread = np.angle(np.exp(1j * (reads.phase_rad - reads.phase_rad[0])))
     assert 0.005 < np.std(spread) < 0.12
@@ -43,8 +43,8 @@ def test_static_tag_repeats_its_phase_within_a_channel():
 
 
 def test_pi_flips_come_at_their_share():
-    reads = virtual_reads(STILL, "A", ReaderSettings(flip_share=0.1), seed=0, antenna_m=np.zeros(3))
-    share = pi_flip_share(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index)
+    reads = virtual_reads(STILL, "A", ReaderSettings(flip_probability=0.1), seed=0, antenna_m=np.zeros(3))
+    share = estimate_flip_probability(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index)
     assert abs(share - 0.1) < 0.03
 
 
@@ -64,8 +64,8 @@ def test_hopping_dwells_and_offsets_are_affine():
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="region"):
         ReaderSettings(region="moon")
-    with pytest.raises(ValueError, match="flip_share"):
-        ReaderSettings(flip_share=0.9)
+    with pytest.raises(ValueError, match="flip_probability"):
+        ReaderSettings(flip_probability=0.9)
     with pytest.raises(ValueError, match="num_tags"):
         ReaderSettings(num_tags=0)
 

@@ -13,8 +13,8 @@ import optax
 
 from ..flow.estimates import NetworkFlow, flow_along
 from ..flow.losses import FlowLossSettings
-from ..flow.named import make_flow
 from ..flow.pyramid import PyramidFlow
+from ..flow.registry import make_flow
 from ..training.flow_step import FlowTrainState, flow_step
 from .timing import Timing, first_call_s, in_own_process, medians_ms, peak_memory_mib
 

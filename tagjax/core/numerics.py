@@ -38,13 +38,6 @@ def wrap_to_pi(angle_rad: Float[Array, "*shape"], period_rad: float = 2 * jnp.pi
     return angle_rad - period_rad * jax.lax.stop_gradient(jnp.floor(angle_rad / period_rad + 0.5))
 
 
-def circular_mean(
-    angle_rad: Float[Array, "*shape axis"], weight: Float[Array, "*#shape axis"]
-) -> Float[Array, "*shape"]:
-    """Direction of the weighted resultant over the last axis; 0 where the resultant vanishes."""
-    return safe_atan2(jnp.sum(weight * jnp.sin(angle_rad), axis=-1), jnp.sum(weight * jnp.cos(angle_rad), axis=-1))
-
-
 def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """log I0(x) for x >= 0, without overflow."""
     return jnp.log(jax.scipy.special.i0e(x)) + x

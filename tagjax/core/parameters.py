@@ -28,28 +28,28 @@ def check_positive(**values: float) -> None:
             raise ValueError(f"{name} is {value}; expected a positive value (it is kept as its logarithm).")
 
 
-def check_shares(**values: float) -> None:
+def check_fractions(**values: float) -> None:
     """Raise `ValueError`, by name, for a value that is no share from 0 to 1."""
     for name, value in values.items():
         if not 0 <= value <= 1:
             raise ValueError(f"{name} is {value}; expected a share from 0 to 1.")
 
 
-def check_whole(**values: int) -> None:
+def check_positive_integers(**values: int) -> None:
     """Raise `ValueError`, by name, for what is no whole number of at least 1."""
     for name, value in values.items():
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"{name} is {value!r}; expected a whole number of at least 1.")
 
 
-def stored_log(value: float) -> Float[Array, ""]:
+def log_parameter(value: float) -> Float[Array, ""]:
     """A positive value as it is stored. Raises `ValueError` for any other."""
     if value <= 0:
         raise ValueError(f"A positive value is needed for a parameter kept as its logarithm; found {value}.")
     return jnp.log(jnp.asarray(value, jnp.float32))
 
 
-def stored_logit(value: float) -> Float[Array, ""]:
+def logit_parameter(value: float) -> Float[Array, ""]:
     """A share as it is stored, kept 1e-6 away from 0 and 1."""
     return jnp.asarray(logit(min(max(value, 1e-6), 1.0 - 1e-6)), jnp.float32)
 
@@ -83,11 +83,11 @@ def with_physical(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
             continue
         if name.startswith(_LOG):
             check_positive(**{name.removeprefix(_LOG): values[name.removeprefix(_LOG)]})
-            leaves[name] = stored_log(values[name.removeprefix(_LOG)])
+            leaves[name] = log_parameter(values[name.removeprefix(_LOG)])
         elif name.startswith(_LOGIT):
             share = values[name.removeprefix(_LOGIT)]
-            check_shares(**{name.removeprefix(_LOGIT): share})
-            leaves[name] = stored_logit(share)
+            check_fractions(**{name.removeprefix(_LOGIT): share})
+            leaves[name] = logit_parameter(share)
         else:
             leaves[name] = jnp.asarray(values[name], jnp.float32)
     names = list(leaves)

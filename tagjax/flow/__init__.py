@@ -6,14 +6,14 @@ from .estimates import FlowEstimate, estimate, flow_along
 from .weights import load_network, packaged_weights, save_weights
 
 if TYPE_CHECKING:
-    from .named import make_flow
+    from .registry import make_flow
 
 __all__ = ["FlowEstimate", "estimate", "flow_along", "load_network", "make_flow", "packaged_weights", "save_weights"]
 
 
 def __getattr__(name: str) -> Any:
     if name == "make_flow":
-        from .named import make_flow
+        from .registry import make_flow
 
         return make_flow
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

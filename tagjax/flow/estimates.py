@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..image.warp import pixel_grid
-from .losses import inconsistency
+from .images import check_images
+from .losses import consistency_error_px2
 from .network import AbstractFlowNetwork
-from .pictures import check_pictures
 
 SHARE, FLOOR_PX2 = 0.01, 0.5
 """Gap of the way there and back, as a share of the squared lengths and in pixels^2, beyond which a pixel is hidden."""
@@ -35,7 +35,7 @@ _compiled: set[Any] = set()
 
 
 class FlowEstimate(eqx.Module):
-    """Flow both ways, each on its own picture's pixels, where its target is hidden, and how sure it is (`agreement`)."""
+    """Flow both ways, each on its own picture's pixels, where its target is hidden, and how sure it is (`consistency`)."""
 
     forward_px: Float[Array, "height width 2"]
     backward_px: Float[Array, "height width 2"]
@@ -49,7 +49,7 @@ HostFlow = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Pictures on the host to flow on the host: a `FlowFunction` (`tagjax.flow.opencv`)."""
 
 
-def agreement(
+def consistency(
     flow_px: Float[Array, "height width 2"],
     back_px: Float[Array, "height width 2"],
     area: Int[Array, " 4"] | None = None,
@@ -63,7 +63,7 @@ def agreement(
     height, width, _ = flow_px.shape
     if area is None:
         area = jnp.asarray([0, 0, width - 1, height - 1], jnp.int32)
-    gap, length = inconsistency(flow_px, back_px)
+    gap, length = consistency_error_px2(flow_px, back_px)
     tolerance = SHARE * length + FLOOR_PX2
     x, y = pixel_grid(height, width, flow_px.dtype)
     u, v = x + flow_px[..., 0], y + flow_px[..., 1]
@@ -124,7 +124,7 @@ def _decode_both(network: AbstractFlowNetwork, first: Any, second: Any) -> tuple
 
 @eqx.filter_jit
 def _judged(forward: Array, backward: Array, area: Array) -> FlowEstimate:
-    ahead, back = agreement(forward, backward, area), agreement(backward, forward, area)
+    ahead, back = consistency(forward, backward, area), consistency(backward, forward, area)
     return FlowEstimate(forward, backward, ahead <= 0.5, back <= 0.5, ahead, back)
 
 
@@ -153,16 +153,16 @@ def _both_ways(network: AbstractFlowNetwork, first: Any, second: Any) -> tuple[A
 
 
 def _checked(first: Any, second: Any) -> tuple[Any, Any]:
-    """Pictures as `check_pictures` has them; what is being traced has no values to look at and is taken as it is."""
+    """Pictures as `check_images` has them; what is being traced has no values to look at and is taken as it is."""
     traced = isinstance(first, jax.core.Tracer) or isinstance(second, jax.core.Tracer)
-    return (jnp.asarray(first), jnp.asarray(second)) if traced else check_pictures(first, second)
+    return (jnp.asarray(first), jnp.asarray(second)) if traced else check_images(first, second)
 
 
 def estimate(flow: AbstractFlowNetwork | HostFlow, first: Any, second: Any) -> FlowEstimate:
     """Flow between two pictures, both ways, with what is hidden and how sure it is; none between equal pictures.
 
     `flow` is a network, or any flow by name (`make_flow`), which is asked once for each way. Takes pictures as
-    `check_pictures` does, whose errors it raises; of a network, within a transformation of JAX, floats (height, width, 3)
+    `check_images` does, whose errors it raises; of a network, within a transformation of JAX, floats (height, width, 3)
     from 0 to 1. Sides that are too short, or no multiple of the network's divisor, are padded by repeating the edge, and the
     flow is cut back.
     """
@@ -187,7 +187,7 @@ def _padded_flow(network: AbstractFlowNetwork, first: Any, second: Any) -> tuple
     return _forward(network, one, other), place
 
 
-def one_way(network: AbstractFlowNetwork, first: Any, second: Any) -> Float[Array, "height width 2"]:
+def forward_flow(network: AbstractFlowNetwork, first: Any, second: Any) -> Float[Array, "height width 2"]:
     """Flow from the first picture to the second, pixels; pictures and errors as of `estimate`."""
     flow_px, place = _padded_flow(network, first, second)
     return flow_px[place]
@@ -207,7 +207,7 @@ class NetworkFlow:
         """Flow forward and backward between neighbouring pictures; each picture is encoded once."""
         before, last, known = None, None, None
         for picture in pictures:
-            checked, _ = check_pictures(picture, picture if before is None else before)
+            checked, _ = check_images(picture, picture if before is None else before)
             grown, place, _ = _padded(self.network, checked)
             features = _encode(self.network, grown)
             if before is not None:
@@ -220,7 +220,7 @@ def flow_along(flow: HostFlow, pictures: Iterable[np.ndarray]) -> Iterator[tuple
     """Flow forward and backward between neighbouring pictures of a video: one pair fewer than pictures.
 
     Who has a way of its own along a video (`along`) goes that way: a network sees each picture once, what needs both ways
-    has them once. Errors as of `check_pictures`.
+    has them once. Errors as of `check_images`.
     """
     along = getattr(flow, "along", None)
     if along is not None:

@@ -39,7 +39,7 @@ class FlowLossSettings:
     edge_weight: float = 50.0  # of the mean absolute colour difference (0 to 1) between neighbours
     occlusion: bool = True
     occlusion_after: int = 500  # steps before which nothing counts as hidden: from scratch, everything would be
-    occlusion_share: float = 0.01  # of the squared lengths
+    occlusion_fraction: float = 0.01  # of the squared lengths
     occlusion_px2: float = 0.5
     self_supervision: float = 0.0
     self_supervision_after: int = 3000
@@ -77,7 +77,7 @@ def inside(flow_px: Float[Array, "height width 2"], margin_px: int = 0) -> Bool[
     return (u >= 0) & (u <= width - 1 + 2 * margin_px) & (v >= 0) & (v <= height - 1 + 2 * margin_px)
 
 
-def margin_of(crop: tuple[int, ...], whole: tuple[int, ...]) -> int:
+def crop_margin_px(crop: tuple[int, ...], whole: tuple[int, ...]) -> int:
     """Pixels by which a whole picture reaches beyond a crop of it, alike at every side; from their shapes."""
     margin = (whole[0] - crop[0]) // 2
     if margin < 0 or whole[:2] != (crop[0] + 2 * margin, crop[1] + 2 * margin):
@@ -85,7 +85,7 @@ def margin_of(crop: tuple[int, ...], whole: tuple[int, ...]) -> int:
     return margin
 
 
-def inconsistency(
+def consistency_error_px2(
     flow_px: Float[Array, "height width 2"], back_px: Float[Array, "height width 2"]
 ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
     """|f + b(x + f)|^2 and |f|^2 + |b(x + f)|^2, pixels^2: how far there and back is from where it began."""
@@ -101,7 +101,7 @@ def occluded(
     floor_px2: float = 0.5,
 ) -> Bool[Array, "height width"]:
     """Where the way back does not lead back: |f + b|^2 >= share (|f|^2 + |b|^2) + floor (Sundaram et al., ECCV 2010)."""
-    gap, length = inconsistency(flow_px, back_px)
+    gap, length = consistency_error_px2(flow_px, back_px)
     return gap >= share * length + floor_px2
 
 
@@ -151,7 +151,7 @@ def data_term(
     The second may reach beyond the first, alike at every side, so that what leaves a crop still teaches (SMURF's
     full-image warping, Section 3.3). The gradient reaches the flow only, not the pictures.
     """
-    margin = margin_of(first.shape, second.shape)
+    margin = crop_margin_px(first.shape, second.shape)
     outer = jnp.pad(flow_px, ((margin, margin), (margin, margin), (0, 0)))
     warped = gather(jax.lax.stop_gradient(second)[..., None], outer)[0][..., 0]
     # Outside, the first picture stands in, so that the neighbours of such pixels see no edge.
@@ -177,7 +177,7 @@ def smoothness(
     return total / 2
 
 
-def teaching_term(
+def self_supervision_term(
     student_px: Float[Array, "rows columns 2"],
     teacher_px: Float[Array, "height width 2"],
     student_hidden: Bool[Array, "rows columns"],
@@ -207,7 +207,7 @@ def shown(
     """
     visible = inside(flow_px, margin_px).astype(flow_px.dtype)
     if settings.occlusion:
-        hidden = occluded(flow_px, back_px, settings.occlusion_share, settings.occlusion_px2)
+        hidden = occluded(flow_px, back_px, settings.occlusion_fraction, settings.occlusion_px2)
         if margin_px:
             hidden = hidden & inside(flow_px)
         visible = visible * (1 - hide * hidden.astype(flow_px.dtype))
@@ -228,9 +228,9 @@ def level_terms(
     the last level before the learned upsampling, which follows the picture's edges by itself.
     """
     height = first.shape[0]
-    margin = margin_of(first.shape, second.shape)
+    margin = crop_margin_px(first.shape, second.shape)
     data, first_order, second_order = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
-    hidden_share = jnp.zeros(())
+    occluded_fraction = jnp.zeros(())
     ways = list(zip(forward[::-1], backward[::-1], strict=True))
     for level, (flow, back) in enumerate(ways[: len(settings.level_weights)]):
         factor = height // flow.shape[0]
@@ -239,13 +239,18 @@ def level_terms(
         here, there = (shrink(image, factor) if factor > 1 else image for image in (first, second))
         visible = shown(flow, back, hide, settings, margin // factor)
         if level == 0:
-            hidden_share = 1 - jnp.mean(visible)
+            occluded_fraction = 1 - jnp.mean(visible)
         term = data_term(flow, to_grey(here), to_grey(there), visible, settings, level)
         data = data + settings.level_weights[level] * term
         if level == min(1, len(ways) - 1):
             first_order = smoothness(flow, here, settings.edge_weight, 1)
             second_order = smoothness(flow, here, settings.edge_weight, 2)
-    return {"data": data, "smooth_first": first_order, "smooth_second": second_order, "hidden_share": hidden_share}
+    return {
+        "data": data,
+        "smooth_first": first_order,
+        "smooth_second": second_order,
+        "occluded_fraction": occluded_fraction,
+    }
 
 
 def sequence_terms(
@@ -269,7 +274,7 @@ def sequence_terms(
         )
     flows = jnp.stack(forward[:-1])
     factor = first.shape[0] // flows.shape[1]
-    margin, rough = margin_of(first.shape, second.shape), shrink(first, factor)
+    margin, rough = crop_margin_px(first.shape, second.shape), shrink(first, factor)
     grey_here, grey_there = to_grey(first), to_grey(second)
     visible = shown(enlarge_flow(forward[-2], factor), enlarge_flow(backward[-2], factor), hide, settings, margin)
 
@@ -286,11 +291,11 @@ def sequence_terms(
         "data": data,
         "smooth_first": first_order,
         "smooth_second": second_order,
-        "hidden_share": 1 - jnp.mean(visible),
+        "occluded_fraction": 1 - jnp.mean(visible),
     }
 
 
-def imitation_term(
+def distillation_term(
     levels: Levels, teacher_px: Float[Array, "height width 2"], settings: FlowLossSettings
 ) -> Float[Array, ""]:
     """How far all estimates of a student are from a teacher's flow: robust end-point errors, weighted by level.

@@ -22,11 +22,11 @@ import zarr
 from jaxtyping import Float, Float32, UInt8
 from rich.progress import Progress, track
 
-from ..core.prepared import made_once
+from ..core.array_cache import cached_array
 from ..core.stream import Stream
 from ..core.types import LazyArray
 from ..recording import RecordingError
-from ..recording.picture_files import in_order, read_colour
+from ..recording.image_files import natural_sorted, read_colour
 from ..recording.store import open_recording
 
 VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
@@ -43,7 +43,7 @@ _MANY_FILES, _NAMED_FILES = 200, 5
 
 
 @dataclasses.dataclass(frozen=True)
-class VariationSettings:
+class AugmentationSettings:
     """How a pair is cut from two pictures, and how what the network sees differs from what the loss compares.
 
     The geometry is the same for both pictures of a pair; light and noise differ a little between them.
@@ -53,17 +53,17 @@ class VariationSettings:
     width: int = 160
     margin_px: int = 0  # at each side of the cut, seen by the loss alone (SMURF's full-image warping)
     scale: tuple[float, float] = (0.7, 1.4)  # log-uniform; a picture too small is enlarged to fit
-    turn_deg: float = 10.0
+    rotation_deg: float = 10.0
     gaps: tuple[int, ...] = (1, 2)  # frames between the pictures of a pair
     gain: float = 0.25  # of both pictures
     gamma: float = 0.25
     tint: float = 0.1  # of each colour
-    unlike: float = 0.05  # gain between the two pictures
+    gain_difference: float = 0.05  # gain between the two pictures
     noise: float = 0.02
-    grey_share: float = 0.1  # pairs without colour
-    transpose_share: float = 0.0  # pairs whose rows become columns
-    negative_share: float = 0.0  # pairs with dark and bright exchanged
-    recolour_share: float = 0.0  # pairs whose colours change places
+    grey_probability: float = 0.1  # pairs without colour
+    transpose_probability: float = 0.0  # pairs whose rows become columns
+    negative_probability: float = 0.0  # pairs with dark and bright exchanged
+    recolour_probability: float = 0.0  # pairs whose colours change places
 
     def __post_init__(self) -> None:
         low, high = self.scale
@@ -75,7 +75,7 @@ class VariationSettings:
             raise ValueError(f"gaps are {self.gaps}; expected frame distances of at least 1.")
         if min(self.height, self.width) < 32:
             raise ValueError(f"Crops of {self.height} x {self.width} are too small; use at least 32 x 32.")
-        for name in ("grey_share", "transpose_share", "negative_share", "recolour_share"):
+        for name in ("grey_probability", "transpose_probability", "negative_probability", "recolour_probability"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected a share, 0 to 1.")
 
@@ -88,7 +88,7 @@ class ImageFolder:
     """
 
     def __init__(self, folder: Path):
-        self._files = in_order(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
+        self._files = natural_sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
         if len(self._files) < 2:
             raise RecordingError(
                 f"{folder} holds {len(self._files)} pictures ({', '.join(IMAGE_ENDINGS)}); a flow needs at least two."
@@ -173,7 +173,7 @@ def _decoded(video: Path, cache: Path) -> LazyArray:
     """The frames of a video, from the cache if it was decoded before."""
     stamp = f"{_DECODING} {video.resolve()} {video.stat().st_size} {video.stat().st_mtime_ns}"
     target = cache / f"{video.stem}-{hashlib.sha256(stamp.encode()).hexdigest()[:12]}.zarr"
-    return made_once(target, lambda path: _decode(video, path))
+    return cached_array(target, lambda path: _decode(video, path))
 
 
 def _decode(video: Path, path: Path) -> None:
@@ -233,7 +233,7 @@ class StackedPairs:
         return np.asarray(self._pairs[int(index)])
 
 
-class TaughtPairs:
+class TeacherPairs:
     """Pairs that lie side by side, with a teacher's flow from first to second, as Grain's random access source."""
 
     def __init__(self, pairs: LazyArray, flow_px: LazyArray):
@@ -252,7 +252,7 @@ class TaughtPairs:
 def vary(
     pair: UInt8[np.ndarray, "2 _ _ 3"],
     rng: np.random.Generator,
-    settings: VariationSettings,
+    settings: AugmentationSettings,
     flow_px: Float32[np.ndarray, "_ _ 2"] | None = None,
 ) -> dict[str, np.ndarray]:
     """A random cut of a pair: `clean`, for the loss, and `seen`, for the network, with other light and noise.
@@ -273,39 +273,39 @@ def vary(
 
 
 def _relit(
-    seen: Float32[np.ndarray, "2 height width 3"], rng: np.random.Generator, settings: VariationSettings
+    seen: Float32[np.ndarray, "2 height width 3"], rng: np.random.Generator, settings: AugmentationSettings
 ) -> UInt8[np.ndarray, "2 height width 3"]:
     """The pair with other light, colour and noise."""
     seen = seen ** np.float32(np.exp(rng.uniform(-settings.gamma, settings.gamma)))
     unlike = rng.uniform(-settings.unlike, settings.unlike, (2, 1, 1, 1))
     tint = rng.uniform(-settings.tint, settings.tint, (1, 1, 1, 3))
     seen = seen * (1 + rng.uniform(-settings.gain, settings.gain) + unlike + tint).astype(np.float32)
-    if rng.uniform() < settings.grey_share:
+    if rng.uniform() < settings.grey_probability:
         seen = np.repeat(np.mean(seen, axis=-1, keepdims=True), 3, axis=-1)
-    if _chance(rng, settings.negative_share):
+    if _chance(rng, settings.negative_probability):
         seen = 1 - seen
-    if _chance(rng, settings.recolour_share):
+    if _chance(rng, settings.recolour_probability):
         seen = seen[..., rng.permutation(3)]
     noise = rng.standard_normal(seen.shape, np.float32) * np.float32(settings.noise * rng.uniform() ** 2)
     return np.clip(np.rint(255 * (seen + noise)), 0, 255).astype(np.uint8)
 
 
 def _placed(
-    whole: tuple[int, ...], rng: np.random.Generator, settings: VariationSettings, size: tuple[int, int]
+    whole: tuple[int, ...], rng: np.random.Generator, settings: AugmentationSettings, size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "2 3"], float]:
     """Where a cut of (rows, columns) `size` lies: from its pixels (x, y, 1) to the picture's; and its scale."""
     (height, width), (rows, columns) = whole, size
     low, high = settings.scale
     scale = np.exp(rng.uniform(np.log(low), np.log(high)))
     scale = max(scale, rows / height, columns / width)
-    turn = np.deg2rad(rng.uniform(-settings.turn_deg, settings.turn_deg))
+    turn = np.deg2rad(rng.uniform(-settings.rotation_deg, settings.rotation_deg))
     # Where the cut's centre lies, such that without a turn all of it is in the picture.
     room = np.array([width - columns / scale, height - rows / scale])
     centre = np.array([(width - 1) / 2, (height - 1) / 2]) + (rng.uniform(size=2) - 0.5) * room
     mirror = rng.choice([-1.0, 1.0], 2)
     cosine, sine = np.cos(turn) / scale, np.sin(turn) / scale
     linear = np.array([[cosine, -sine], [sine, cosine]]) * mirror
-    if _chance(rng, settings.transpose_share):
+    if _chance(rng, settings.transpose_probability):
         linear = linear[:, ::-1]
     corner = centre - linear @ np.array([(columns - 1) / 2, (rows - 1) / 2])
     return np.concatenate([linear, corner[:, None]], axis=1), float(scale)
@@ -344,7 +344,7 @@ def _cut_flow(
 
 
 class _Vary(grain.transforms.RandomMap):
-    def __init__(self, settings: VariationSettings):
+    def __init__(self, settings: AugmentationSettings):
         self._settings = settings
 
     def random_map(self, element: Any, rng: np.random.Generator) -> Any:
@@ -354,9 +354,9 @@ class _Vary(grain.transforms.RandomMap):
 
 
 def pair_dataset(
-    sources: Sequence[PairSource | StackedPairs | TaughtPairs],
+    sources: Sequence[PairSource | StackedPairs | TeacherPairs],
     shares: Sequence[float],
-    settings: VariationSettings,
+    settings: AugmentationSettings,
     *,
     seed: int,
     workers: int = 0,

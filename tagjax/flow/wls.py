@@ -1,7 +1,7 @@
 """A flow smoothed by how far the ways there and back agree: what is hidden takes the flow of what it belongs to.
 
 Where a pixel's target is hidden no picture says how it moves, and a flow there is a guess that does not lead back. So
-every pixel weighs by its `agreement`, and one solve of the whole picture, which stops at the picture's edges, lets those
+every pixel weighs by its `consistency`, and one solve of the whole picture, which stops at the picture's edges, lets those
 that agree speak for those that do not.
 """
 

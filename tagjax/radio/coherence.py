@@ -47,19 +47,19 @@ def phase_likelihood(
     channel: Int[Array, "*#batch reads"],
     *,
     num_channels: int,
-    flip_share: float,
+    flip_probability: float,
     num_iterations: int = 3,
 ) -> Float[Array, "*batch"]:
     """Log likelihood ratio of reads to phases at random, offsets profiled out and pi flips marginalised, in nats.
 
-    sum_c max_o sum_{r in c} log [(1 - q) exp(k_r cos(e_r - o)) + q exp(-k_r cos(e_r - o))] / I0(k_r): von Mises noise of concentration k_r (0 for what is no read), flips of probability q = `flip_share` in
+    sum_c max_o sum_{r in c} log [(1 - q) exp(k_r cos(e_r - o)) + q exp(-k_r cos(e_r - o))] / I0(k_r): von Mises noise of concentration k_r (0 for what is no read), flips of probability q = `flip_probability` in
     (0, 1), each channel's offset o the most likely one. The doubled angle gives it modulo pi, and expectation-maximisation
     of the flips from both ends refines it. It carries no gradient, since the likelihood is stationary there. Without reads 0.
     """
     residual_rad, concentration, channel = jnp.broadcast_arrays(residual_rad, concentration, channel)
     member = jax.nn.one_hot(channel, num_channels, dtype=residual_rad.dtype)
     fixed = jax.lax.stop_gradient(residual_rad)
-    log_odds = jnp.log1p(-flip_share) - jnp.log(flip_share)
+    log_odds = jnp.log1p(-flip_probability) - jnp.log(flip_probability)
 
     def of_channels(values: Float[Array, "*batch reads"]) -> Float[Array, "*batch channels"]:
         return jnp.einsum("...r,...rc->...c", values, member)
@@ -76,7 +76,7 @@ def phase_likelihood(
             towards = concentration * jnp.cos(fixed - of_reads(offset))
             offset = direction(concentration * jnp.tanh(towards + 0.5 * log_odds), 1.0)
         towards = concentration * jnp.cos(residual_rad - of_reads(jax.lax.stop_gradient(offset)))
-        either = jnp.logaddexp(towards + jnp.log1p(-flip_share), jnp.log(flip_share) - towards)
+        either = jnp.logaddexp(towards + jnp.log1p(-flip_probability), jnp.log(flip_probability) - towards)
         return of_channels(either - log_i0(concentration))
 
     half = direction(concentration, 2.0)

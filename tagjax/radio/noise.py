@@ -23,7 +23,9 @@ def thermal_sigma_rad(rssi_dbm: np.ndarray) -> np.ndarray:
     return np.hypot(FLOOR_RAD, 10.0 ** (SLOPE_PER_DBM * rssi + INTERCEPT))
 
 
-def pi_flip_share(phase_rad: np.ndarray, time_s: np.ndarray, channel: np.ndarray, *, max_gap_s: float = 0.03) -> float:
+def estimate_flip_probability(
+    phase_rad: np.ndarray, time_s: np.ndarray, channel: np.ndarray, *, max_gap_s: float = 0.03
+) -> float:
     """Share of reads that carry an extra pi, from steps between adjacent reads of one channel.
 
     A step within 0.5 rad of pi is a transition; independent flips at share p make 2 p (1 - p) of them. NaN

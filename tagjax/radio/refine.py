@@ -9,7 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..core.numerics import SPEED_OF_LIGHT_M_S, wrap_to_pi
-from .grid_filter import RadioModel, level_phase
+from .bayes_filter import RadioModel, remove_channel_slope
 from .reads import PhaseReads
 
 _OFFSET_STD_RAD = 10.0
@@ -55,7 +55,7 @@ def refine_path(
     dtype = knot_s.dtype
     weights = interpolation_weights(reads.time_s, knot_s)
     wavenumber = (4 * jnp.pi / SPEED_OF_LIGHT_M_S) * reads.carrier_hz
-    level = level_phase(reads, model, reference_hz)
+    level = remove_channel_slope(reads, model, reference_hz)
     sigma = jnp.sqrt(jnp.square(reads.sigma_rad) + model.multipath_rad**2)
     inside = reads.valid & (reads.time_s >= knot_s[0]) & (reads.time_s <= knot_s[-1])
     precision = jnp.where(inside, 1.0 / sigma, 0.0)

@@ -75,7 +75,7 @@ class Recording:
     name: str = "recording"
     source: str = ""  # what it was made from, and how
     store: Any = None  # the open Zarr group, where it comes from one
-    forwards: Recording | None = None  # the recording that this one is, played backwards
+    reversed_from: Recording | None = None  # the original of a time-reversed recording
 
     @property
     def num_frames(self) -> int:

@@ -78,7 +78,7 @@ class InventorySettings:
 
     def reader(self) -> ReaderSettings:
         """The part that `ReaderState.draw` and `channel_at` go by."""
-        return ReaderSettings(region=self.region, flip_share=self.flip_share, dwell_s=self.dwell_s)
+        return ReaderSettings(region=self.region, flip_probability=self.flip_share, dwell_s=self.dwell_s)
 
 
 @dataclasses.dataclass(frozen=True)

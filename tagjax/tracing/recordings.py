@@ -14,7 +14,7 @@ import numpy as np
 
 from ..radio.reads import RadioWindow
 from ..recording import Recording, RecordingError
-from ..recording.backwards import played_backwards
+from ..recording.time_reversal import time_reversed
 from .tracer import AbstractSmoother, AbstractTracer, Camera, Frame, Later, Trace
 
 
@@ -151,7 +151,7 @@ def _look_back(
     kept: dict[int, Later] = {}
     log_odds: np.ndarray | None = None
     for number, said in _run(
-        _step_back, tracer, played_backwards(recording), load, epcs, settings, (count - last, count - first)
+        _step_back, tracer, time_reversed(recording), load, epcs, settings, (count - last, count - first)
     ):
         told: Later = jax.tree.map(lambda *leaves: np.concatenate(leaves), *said)
         if log_odds is None:

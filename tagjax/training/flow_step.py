@@ -14,12 +14,12 @@ from jaxtyping import Array, Float, Int, PyTree, UInt32
 from ..core.compilation import large_program
 from ..flow.losses import (
     FlowLossSettings,
-    imitation_term,
+    crop_margin_px,
+    distillation_term,
     level_terms,
-    margin_of,
     occluded,
+    self_supervision_term,
     sequence_terms,
-    teaching_term,
     weighted,
 )
 from ..flow.network import AbstractFlowNetwork, Levels, flow_both_ways
@@ -66,7 +66,9 @@ def pair_terms(
     small = seen[:, border:-border, border:-border]
     there, back = flow_both_ways(network, small[0], small[1])
     parts = [
-        teaching_term(mine[-1], whole[-1], occluded(mine[-1], other[-1]), occluded(whole[-1], whole_other[-1]), border)
+        self_supervision_term(
+            mine[-1], whole[-1], occluded(mine[-1], other[-1]), occluded(whole[-1], whole_other[-1]), border
+        )
         for mine, other, whole, whole_other in ((there, back, forward, backward), (back, there, backward, forward))
     ]
     return {**terms, "teaching": (parts[0] + parts[1]) / 2}
@@ -81,7 +83,7 @@ def terms_both_ways(
     settings: FlowLossSettings,
 ) -> dict[str, Float[Array, ""]]:
     """Terms of estimates for the middle of two pictures, a part of (height, width) `size`; the mean of both ways."""
-    margin, (height, width) = margin_of(size, clean.shape[1:3]), size
+    margin, (height, width) = crop_margin_px(size, clean.shape[1:3]), size
     middle = clean[:, margin : margin + height, margin : margin + width]
     terms_of = sequence_terms if settings.sequence_decay > 0 else level_terms
     # Mapped, not written twice: less to compile.
@@ -115,10 +117,10 @@ def imitation_loss(
     teacher_px: Float[Array, "batch height width 2"],
     settings: FlowLossSettings,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Mean over a batch of `imitation_term`, first to second picture; it is the whole loss of a student."""
+    """Mean over a batch of `distillation_term`, first to second picture; it is the whole loss of a student."""
 
     def one(pair: Array, flow_px: Array) -> Array:
-        return imitation_term(network.decode(network.encode(pair[0]), network.encode(pair[1])), flow_px, settings)
+        return distillation_term(network.decode(network.encode(pair[0]), network.encode(pair[1])), flow_px, settings)
 
     value = jnp.mean(jax.vmap(one)(seen, teacher_px))
     return value, {"imitation": value}

@@ -17,7 +17,7 @@ import scipy.optimize
 from jaxtyping import UInt8, UInt16
 
 from ...core.errors import RecordingError
-from ..picture_files import in_order, read_colour
+from ..image_files import natural_sorted, read_colour
 from .rgbd_folder import DepthToColour, load_calibration, read_mat_depth
 
 NO_CORRECTION = (0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
@@ -173,7 +173,7 @@ def estimate_folder_correction(folder: str | Path, calibration: str | Path) -> R
 
     Raises `RecordingError` where there are no pictures, or they differ in size.
     """
-    pictures = in_order(Path(folder).glob("*.jpg"))
+    pictures = natural_sorted(Path(folder).glob("*.jpg"))
     if not pictures:
         raise RecordingError(f"{folder}: no .jpg file; expected pictures with .mat files of the same names.")
     pictures = [pictures[i] for i in _every(len(pictures), FOLDER_FRAMES)]

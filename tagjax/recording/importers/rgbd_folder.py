@@ -14,7 +14,7 @@ import scipy.io
 from ...core.camera import Intrinsics
 from ...core.errors import RecordingError
 from ...core.geometry import register_depth, undistort
-from ..picture_files import in_order, read_colour, read_labels, read_picture
+from ..image_files import natural_sorted, read_colour, read_image, read_labels
 from ..reads import TagReads
 from ..recording import Recording, Truth
 
@@ -136,7 +136,7 @@ def import_jpg_mat(
     missing or differ in size.
     """
     folder = Path(folder)
-    pictures = in_order(folder.glob("*.jpg"))
+    pictures = natural_sorted(folder.glob("*.jpg"))
     if not pictures:
         raise RecordingError(f"{folder}: no .jpg file; expected pictures with .mat files of the same names.")
     depths = [picture.with_suffix(".mat") for picture in pictures]
@@ -165,7 +165,7 @@ def import_jpg_mat(
 
     truth = None
     if masks is not None:
-        labels = in_order(Path(masks).glob("*.png"))
+        labels = natural_sorted(Path(masks).glob("*.png"))
         if len(labels) != len(pictures):
             raise RecordingError(f"{masks}: {len(labels)} masks for {len(pictures)} pictures; expected one a picture.")
         truth = Truth(labels=FrameFiles(labels, read_labels, first.shape[:2], np.uint8))
@@ -235,7 +235,7 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
         return undistort(picture, np.zeros(shape[:2], np.float32), lens)[0]
 
     def depth_mm(path: Path) -> np.ndarray:
-        raw = read_picture(path, cv2.IMREAD_UNCHANGED)
+        raw = read_image(path, cv2.IMREAD_UNCHANGED)
         if raw.dtype != np.uint16 or raw.ndim != 2:
             raise RecordingError(f"{path}: {raw.dtype} of shape {raw.shape}; expected a 16-bit grey depth picture.")
         depth = np.rint(raw * (1000.0 / TUM_UNITS_PER_M)).astype(np.float32)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..image.census import to_grey
 from ..image.warp import gather, pixel_grid
-from .pictures import as_bytes, check_pictures
+from .images import check_images, to_uint8
 
 BLOCK_PX = 7
 """Side of the square over which residuals are averaged."""
@@ -30,7 +30,7 @@ GENTLE_GAIN, GENTLE_BLOCK_PX = 1.75, 25
 _LEAST_VARIANCE = 0.25  # of eight-bit brightness: rounding alone has 1/6 in a difference
 
 
-def settled(
+def zero_stationary(
     flow_px: Float[np.ndarray, "height width 2"],
     here: Any,
     there: Any,
@@ -41,9 +41,9 @@ def settled(
     """The flow from `here` to `there`, zero where rest explains the pictures as well.
 
     Rest is kept where |I(x) - J(x)|^2 <= `gain` |I(x) - J(x + u)|^2 + rounding, both averaged over a block of the
-    brightness. Takes pictures as `check_pictures` does, whose errors it raises.
+    brightness. Takes pictures as `check_images` does, whose errors it raises.
     """
-    pictures = map(as_bytes, check_pictures(here, there))
+    pictures = map(to_uint8, check_images(here, there))
     one, other = (cv2.cvtColor(np.asarray(each), cv2.COLOR_RGB2GRAY).astype(np.float32) for each in pictures)
     height, width = one.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -54,12 +54,12 @@ def settled(
     return np.where(still[..., None], np.float32(0.0), flow)
 
 
-def has_moved(
+def is_moving(
     flow_px: Float[Array, "height width 2"],
     here: Float[Array, "height width 3"],
     there: Float[Array, "height width 3"],
 ) -> Bool[Array, "height width"]:
-    """Where `settled` keeps the flow; as a function of JAX, of pictures from 0 to 1. It carries no gradient."""
+    """Where `zero_stationary` keeps the flow; as a function of JAX, of pictures from 0 to 1. It carries no gradient."""
     height, width, _ = flow_px.shape
     one, other = (255 * to_grey(each) for each in (here, there))
     corner = jnp.asarray([width - 1, height - 1], flow_px.dtype)

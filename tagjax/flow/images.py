@@ -12,7 +12,7 @@ _RULE = (
 )
 
 
-def check_pictures(
+def check_images(
     first: Any, second: Any
 ) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width 3"]]:
     """Both pictures as RGB of one size and kind: uint8 if both are, else float32 from 0 to 1.
@@ -30,7 +30,7 @@ def check_pictures(
             "resize them alike."
         )
     if pictures[0].dtype != pictures[1].dtype:
-        pictures = [as_unit(picture) for picture in pictures]
+        pictures = [to_float(picture) for picture in pictures]
     return pictures[0], pictures[1]
 
 
@@ -73,11 +73,11 @@ def _unit(picture: np.ndarray, name: str) -> np.ndarray:
     return np.clip(picture.astype(np.float32), 0, 1)
 
 
-def as_unit(picture: Shaped[np.ndarray, "height width channel"]) -> Float[np.ndarray, "height width channel"]:
+def to_float(picture: Shaped[np.ndarray, "height width channel"]) -> Float[np.ndarray, "height width channel"]:
     """uint8 levels as float32 from 0 to 1; such floats as they are."""
     return picture.astype(np.float32) / np.float32(255) if picture.dtype == np.uint8 else picture
 
 
-def as_bytes(picture: Shaped[np.ndarray, "height width channel"]) -> UInt8[np.ndarray, "height width channel"]:
+def to_uint8(picture: Shaped[np.ndarray, "height width channel"]) -> UInt8[np.ndarray, "height width channel"]:
     """Floats from 0 to 1 as uint8 levels; such levels as they are."""
     return picture if picture.dtype == np.uint8 else np.rint(255 * picture).astype(np.uint8)

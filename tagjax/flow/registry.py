@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import opencv, wls
-from .estimates import NetworkFlow, agreement, flow_along
+from .estimates import NetworkFlow, consistency, flow_along
+from .images import check_images, to_float
 from .opencv import FlowFunction
-from .pictures import as_unit, check_pictures
-from .stillness import BLOCK_PX, GAIN, GENTLE_BLOCK_PX, GENTLE_GAIN, settled
-from .weights import find_weights, load_network, packaged_weights, weights_about
+from .stationary import BLOCK_PX, GAIN, GENTLE_BLOCK_PX, GENTLE_GAIN, zero_stationary
+from .weights import find_weights, load_network, packaged_weights, weights_metadata
 from .wls import weighted_least_squares
 
 
@@ -29,22 +29,24 @@ class ZeroFlow:
     """No motion anywhere: what every flow has to beat."""
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        one, _ = check_pictures(first, second)
+        one, _ = check_images(first, second)
         return np.zeros((*one.shape[:2], 2), np.float32)
 
 
-class SettledFlow:
-    """Another flow, zero where rest explains the pictures as well (`settled`, gently): for a camera that stands."""
+class ZeroStationaryFlow:
+    """Another flow, zero where rest explains the pictures as well (`zero_stationary`, gently): for a camera that stands."""
 
     def __init__(self, flow: FlowFunction):
         self.flow = flow
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return settled(np.asarray(self.flow(first, second)), first, second, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
+        return zero_stationary(
+            np.asarray(self.flow(first, second)), first, second, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX
+        )
 
     def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Flow forward and backward between neighbouring pictures, as `flow_along` of the other gives it."""
-        return settled_along(self.flow, pictures, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
+        return zero_stationary_along(self.flow, pictures, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
 
 
 class SmoothedFlow:
@@ -77,12 +79,12 @@ def _smoothed_by_agreement(
     back_px: Float[Array, "height width 2"],
     picture: Float[Array, "height width 3"],
 ) -> Float[Array, "height width 2"]:
-    return weighted_least_squares(flow_px, agreement(flow_px, back_px), picture)
+    return weighted_least_squares(flow_px, consistency(flow_px, back_px), picture)
 
 
 def _smoothed(flow_px: np.ndarray, back_px: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    picture, _ = check_pictures(picture, picture)
-    return np.asarray(_smoothed_by_agreement(*map(jnp.asarray, (flow_px, back_px, as_unit(picture)))))
+    picture, _ = check_images(picture, picture)
+    return np.asarray(_smoothed_by_agreement(*map(jnp.asarray, (flow_px, back_px, to_float(picture)))))
 
 
 CLASSICAL: dict[str, Callable[[], FlowFunction]] = {"zero": ZeroFlow, **opencv.FLOWS}
@@ -92,18 +94,18 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "pyramid_mid": ("pyramid", {"octaves": (-1, 0, 1), "medians": 2}),
     "pyramid_fine": ("pyramid", {"octaves": (-1, 0, 1, 2), "medians": 2}),
 }
-"""Packaged weights with other settings of their network, by name; `<name>:<weights.npz>` has a file's weights in their place."""
+"""Packaged weights with other settings of their network, by name; `<name>:<weights.safetensors>` has a file's weights in their place."""
 
 _UNTRAINED = ("flownet_s", "flownet_c", "raft_small")
 
 SUFFIXES: dict[str, tuple[Callable[[FlowFunction], FlowFunction], str]] = {
     "+wls": (SmoothedFlow, wls.settings_key()),
-    "+rest": (SettledFlow, f"{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"),
+    "+rest": (ZeroStationaryFlow, f"{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"),
 }
 """What may follow a flow's name, one after the other: what it makes of the flow before it, and a key of its settings."""
 
 
-def taken_apart(name: str) -> tuple[str, str]:
+def split_suffixes(name: str) -> tuple[str, str]:
     """A flow's name without its `SUFFIXES`, and those, or nothing."""
     bare = name
     while (last := _last_suffix(bare)) is not None:
@@ -116,9 +118,9 @@ def _last_suffix(name: str) -> str | None:
 
 
 def make_flow(name: str) -> FlowFunction:
-    """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of an .npz of weights.
+    """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of a .safetensors of weights.
 
-    `pyramid_fine:<weights.npz>` is a variant with the weights of a file, such as fine-tuned ones. With `SUFFIXES` after
+    `pyramid_fine:<weights.safetensors>` is a variant with the weights of a file, such as fine-tuned ones. With `SUFFIXES` after
     it, in that order applied. Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
     """
     if (suffix := _last_suffix(name)) is not None:
@@ -147,14 +149,14 @@ def flow_key(name: str) -> str:
     return f"{key}-{variant}-{changes[:8]}"
 
 
-def settled_along(
+def zero_stationary_along(
     flow: FlowFunction, pictures: Iterable[np.ndarray], *, gain: float = GAIN, block_px: int = BLOCK_PX
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """`flow_along`, zero where rest explains the pictures as well (`settled`)."""
+    """`flow_along`, zero where rest explains the pictures as well (`zero_stationary`)."""
     for (forward, backward), (one, other) in _with_pictures(flow, pictures):
         yield (
-            settled(forward, one, other, gain=gain, block_px=block_px),
-            settled(backward, other, one, gain=gain, block_px=block_px),
+            zero_stationary(forward, one, other, gain=gain, block_px=block_px),
+            zero_stationary(backward, other, one, gain=gain, block_px=block_px),
         )
 
 
@@ -168,17 +170,17 @@ def _variant(name: str) -> tuple[str | None, str]:
 
 def _weights(name: str) -> Path:
     variant, source = _variant(name)
-    if variant is not None or source.endswith(".npz") or source in packaged_weights():
+    if variant is not None or source.endswith(".safetensors") or source in packaged_weights():
         return find_weights(source)
     there = ", ".join(packaged_weights()) or "none"
     if name in _UNTRAINED:
         raise ValueError(
             f"The network {name!r} comes without weights (there are: {there}). Train it, `python -m experiments.train_flow "
-            f"flow={name}`, and give <run>/weights.npz as the flow."
+            f"flow={name}`, and give <run>/weights.safetensors as the flow."
         )
     raise ValueError(
         f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({there}), "
-        f"the path of an .npz file of weights, or <variant>:<path>; {' and '.join(SUFFIXES)} may follow."
+        f"the path of a .safetensors file of weights, or <variant>:<path>; {' and '.join(SUFFIXES)} may follow."
     )
 
 
@@ -197,5 +199,5 @@ def _network_flow(name: str, path: str, stamp: tuple[int, int]) -> NetworkFlow:
 @functools.lru_cache(maxsize=64)
 def _weights_key(path: str, stamp: tuple[int, int]) -> str:
     digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    network = str(weights_about(path)["flow"]["_target_"]).rsplit(".", 1)[-1]
+    network = str(weights_metadata(path)["flow"]["_target_"]).rsplit(".", 1)[-1]
     return f"{network}-{digest[:16]}"

@@ -13,7 +13,7 @@ import numpy as np
 from ..core.errors import RecordingError
 
 
-def in_order(paths: Iterable[Path]) -> list[Path]:
+def natural_sorted(paths: Iterable[Path]) -> list[Path]:
     """Files of one folder by their names, the numbers in these by their value: frame2 before frame10."""
     return sorted(paths, key=lambda path: (_parts(path.stem), path.name))
 
@@ -50,7 +50,7 @@ def _png_is_whole(data: bytes) -> bool:
     return False
 
 
-def read_picture(path: Path, flags: int) -> np.ndarray:
+def read_image(path: Path, flags: int) -> np.ndarray:
     """What OpenCV reads of a picture file with these flags. One that is cut short or damaged raises `RecordingError`."""
     try:
         data = path.read_bytes()
@@ -72,9 +72,9 @@ def read_picture(path: Path, flags: int) -> np.ndarray:
 
 def read_colour(path: Path) -> np.ndarray:
     """An RGB picture, uint8 (height, width, 3). One that is cut short raises `RecordingError`."""
-    return read_picture(path, cv2.IMREAD_COLOR)[..., ::-1]
+    return read_image(path, cv2.IMREAD_COLOR)[..., ::-1]
 
 
 def read_labels(path: Path) -> np.ndarray:
     """A label picture, uint8 (height, width). One that is cut short raises `RecordingError`."""
-    return read_picture(path, cv2.IMREAD_GRAYSCALE)
+    return read_image(path, cv2.IMREAD_GRAYSCALE)

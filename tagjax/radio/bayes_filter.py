@@ -20,8 +20,8 @@ class RadioModel(eqx.Module):
     """What the robust estimator assumes. Arrays are differentiable; the grid is static."""
 
     multipath_rad: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.15)
-    flip_share: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.05)
-    outlier_share: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.02)
+    flip_probability: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.05)
+    outlier_probability: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.02)
     velocity_walk_m2_s3: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=2.0)
     acceleration_m_s2: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=3.0)
     slope_rad_hz: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.0)
@@ -46,7 +46,9 @@ def reference_carrier(reads: PhaseReads) -> Float[Array, ""]:
     return jnp.where(jnp.sum(weight) > 0, mean, 915e6)
 
 
-def level_phase(reads: PhaseReads, model: RadioModel, reference_hz: Float[Array, ""]) -> Float[Array, " reads"]:
+def remove_channel_slope(
+    reads: PhaseReads, model: RadioModel, reference_hz: Float[Array, ""]
+) -> Float[Array, " reads"]:
     """Phases with the affine channel offset slope * (f - f_reference) taken out."""
     return reads.phase_rad - model.slope_rad_hz * (reads.carrier_hz - reference_hz)
 
@@ -85,7 +87,7 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
     decay = jnp.asarray(2.0 - 2.0 * np.cos(np.pi * k / num_velocities), dtype) / spacing**2
     reference = reference_carrier(reads)
     wavenumber = 4 * jnp.pi * reference / SPEED_OF_LIGHT_M_S
-    phase = level_phase(reads, model, reference)
+    phase = remove_channel_slope(reads, model, reference)
     kappa = 1.0 / (jnp.square(reads.sigma_rad) + model.multipath_rad**2)
 
     def advance(carry, read):
@@ -108,9 +110,9 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
         bump = jnp.exp(concentration * (jnp.cos(away) - 1.0))
         flipped = jnp.exp(concentration * (-jnp.cos(away) - 1.0))
         norm = jnp.sqrt(concentration / (2 * jnp.pi))
-        likelihood = (1 - model.outlier_share) * norm * (
-            (1 - model.flip_share) * bump + model.flip_share * flipped
-        ) + model.outlier_share / (2 * jnp.pi)
+        likelihood = (1 - model.outlier_probability) * norm * (
+            (1 - model.flip_probability) * bump + model.flip_probability * flipped
+        ) + model.outlier_probability / (2 * jnp.pi)
         posterior = predicted * likelihood[:, None]
         posterior = posterior / jnp.sum(posterior)
         marginal = jnp.sum(posterior, axis=1)

@@ -53,7 +53,7 @@ def _turned_reads(reads: TagReads, first_ns: int, last_ns: int) -> TagReads:
     )
 
 
-def played_backwards(recording: Recording) -> Recording:
+def time_reversed(recording: Recording) -> Recording:
     """The recording with its last frame first, between the same two times. Of its truth the tags' ranges come along."""
     first_ns, last_ns = int(recording.time_ns[0]), int(recording.time_ns[-1])
     truth = recording.truth
@@ -67,5 +67,5 @@ def played_backwards(recording: Recording) -> Recording:
         truth=Truth(tag_range_m=ranges) if ranges else None,
         clock=None,
         store=None,
-        forwards=recording,
+        reversed_from=recording,
     )

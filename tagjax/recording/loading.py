@@ -12,7 +12,7 @@ import numpy as np
 from ..core.errors import RecordingError
 from ..core.settings import ConfigError, from_mapping
 from ..radio.reader import ReaderSettings
-from .picture_files import read_labels
+from .image_files import read_labels
 from .reads import join_reads
 from .recording import Recording, Truth
 from .store import open_recording
@@ -37,7 +37,7 @@ class VirtualTagSettings:
             )
 
 
-def opened(paths: Sequence[str], virtual_tag: VirtualTagSettings) -> list[Recording]:
+def open_recordings(paths: Sequence[str], virtual_tag: VirtualTagSettings) -> list[Recording]:
     """The recordings at these paths, with virtual tags where tracks are given. Raises as `open_recording` does."""
     return [with_virtual_tags(open_recording(path), virtual_tag) for path in paths]
 
