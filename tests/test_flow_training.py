@@ -18,18 +18,12 @@ import pytest
 from jaxtyping import Array, Float
 
 from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.flow.augmentation import AugmentationSettings, augment
 from tagjax.flow.estimates import NetworkFlow
+from tagjax.flow.image_pairs import PairSource, StackedPairs, pair_dataset
+from tagjax.flow.image_sequences import ImageFolder, open_sequence
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.network import AbstractFlowNetwork
-from tagjax.flow.picture_pairs import (
-    AugmentationSettings,
-    ImageFolder,
-    PairSource,
-    StackedPairs,
-    open_sequence,
-    pair_dataset,
-    vary,
-)
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
 from tagjax.flow.registry import make_flow
@@ -228,8 +222,8 @@ def test_pairs_are_the_gaps_apart() -> None:
 def test_without_variation_the_cut_is_a_piece_of_the_pictures() -> None:
     pair = smooth_pictures(2, 64, 80)
     for seed in range(6):
-        cut = vary(pair, np.random.default_rng(seed), PLAIN)
-        np.testing.assert_array_equal(cut["clean"], cut["seen"])
+        cut = augment(pair, np.random.default_rng(seed), PLAIN)
+        np.testing.assert_array_equal(cut["clean"], cut["augmented"])
         best = min(
             np.mean(np.abs(cv2.matchTemplate(candidate[which], cut["clean"][0], cv2.TM_SQDIFF_NORMED).min()))
             for which in (0, 1)
@@ -244,15 +238,15 @@ def test_both_pictures_are_cut_alike_and_variation_spares_the_clean_ones() -> No
     pair = np.stack([picture, picture])
     settings = AugmentationSettings(height=64, width=64)
     for seed in range(4):
-        found = vary(pair, np.random.default_rng(seed), settings)
+        found = augment(pair, np.random.default_rng(seed), settings)
         np.testing.assert_array_equal(found["clean"][0], found["clean"][1])
-        assert np.any(found["seen"] != found["clean"])
-        again = vary(pair, np.random.default_rng(seed), settings)
-        np.testing.assert_array_equal(found["seen"], again["seen"])
+        assert np.any(found["augmented"] != found["clean"])
+        again = augment(pair, np.random.default_rng(seed), settings)
+        np.testing.assert_array_equal(found["augmented"], again["augmented"])
 
 
 def test_small_pictures_are_enlarged_to_the_cut() -> None:
-    found = vary(smooth_pictures(2, 20, 20), np.random.default_rng(0), PLAIN)
+    found = augment(smooth_pictures(2, 20, 20), np.random.default_rng(0), PLAIN)
     assert found["clean"].shape == (2, 32, 48, 3)
 
 
@@ -260,10 +254,10 @@ def test_the_clean_pictures_reach_further_by_the_margin() -> None:
     settings = dataclasses.replace(PLAIN, margin_px=8)
     pair = smooth_pictures(2, 64, 80)
     for seed in range(4):
-        found = vary(pair, np.random.default_rng(seed), settings)
+        found = augment(pair, np.random.default_rng(seed), settings)
         assert found["clean"].shape == (2, 48, 64, 3)
-        np.testing.assert_array_equal(found["clean"][:, 8:-8, 8:-8], found["seen"])
-    wide = vary(smooth_pictures(2, 20, 20), np.random.default_rng(0), settings)
+        np.testing.assert_array_equal(found["clean"][:, 8:-8, 8:-8], found["augmented"])
+    wide = augment(smooth_pictures(2, 20, 20), np.random.default_rng(0), settings)
     assert wide["clean"].shape == (2, 48, 64, 3)
 
 
@@ -284,10 +278,10 @@ def test_flow_is_cut_as_the_pictures_are() -> None:
     inner = slice(12, -12), slice(12, -12)
     for seed in range(6):
         varied = dataclasses.replace(settings, transpose_probability=float(seed % 2))
-        found = vary(pair, np.random.default_rng(seed), varied, flow)
+        found = augment(pair, np.random.default_rng(seed), varied, flow)
         assert found["flow_px"].shape == (64, 64, 2)
         assert found["clean"].shape == (2, 80, 80, 3)
-        one, other = found["seen"].astype(np.float32)
+        one, other = found["augmented"].astype(np.float32)
         known = np.all(np.isfinite(found["flow_px"]), axis=-1)[inner]
         back = np.abs(_moved(np.nan_to_num(found["flow_px"]), other) - one)[inner][known]
         still = np.abs(other - one)[inner][known]
@@ -299,7 +293,7 @@ def test_beyond_the_picture_there_is_no_flow() -> None:
     flow = np.ones((64, 64, 2), np.float32)
     settings = dataclasses.replace(PLAIN, height=64, width=64, rotation_deg=45.0)
     shares = [
-        np.isnan(vary(smooth_pictures(2, 64, 64), np.random.default_rng(seed), settings, flow)["flow_px"]).mean()
+        np.isnan(augment(smooth_pictures(2, 64, 64), np.random.default_rng(seed), settings, flow)["flow_px"]).mean()
         for seed in range(4)
     ]
     assert max(shares) > 0.05
@@ -307,18 +301,22 @@ def test_beyond_the_picture_there_is_no_flow() -> None:
 
 def test_negatives_and_exchanged_colours_are_those() -> None:
     pair = smooth_pictures(2, 64, 80)
-    plain = vary(pair, np.random.default_rng(0), PLAIN)
-    negative = vary(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_probability=1.0))
+    plain = augment(pair, np.random.default_rng(0), PLAIN)
+    negative = augment(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_probability=1.0))
     np.testing.assert_array_equal(negative["clean"], plain["clean"])
-    np.testing.assert_allclose(negative["seen"].astype(float), 255 - plain["seen"].astype(float), atol=1)
+    np.testing.assert_allclose(negative["augmented"].astype(float), 255 - plain["augmented"].astype(float), atol=1)
     orders = set()
     for seed in range(8):
-        found = vary(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_probability=1.0))
+        found = augment(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_probability=1.0))
         order = [
-            int(np.argmin([np.abs(found["seen"][..., n].astype(int) - found["clean"][..., k]).sum() for k in range(3)]))
+            int(
+                np.argmin(
+                    [np.abs(found["augmented"][..., n].astype(int) - found["clean"][..., k]).sum() for k in range(3)]
+                )
+            )
             for n in range(3)
         ]
-        np.testing.assert_array_equal(found["seen"], found["clean"][..., order])
+        np.testing.assert_array_equal(found["augmented"], found["clean"][..., order])
         orders.add(tuple(order))
     assert len(orders) > 2
 
@@ -418,7 +416,7 @@ def test_a_student_is_given_its_teachers_flow_of_drawn_pairs_and_of_cuts(tmp_pat
         sample = next(samples)
         assert sample["flow_px"].shape == (32, 32, 2)
         assert sample["flow_px"].dtype == np.float32
-        assert sample["seen"].shape == (2, 32, 32, 3)
+        assert sample["augmented"].shape == (2, 32, 32, 3)
     samples.close()
     kept = {path.name.split("-")[0] for path in Path(settings.drawn.folder).iterdir()}
     assert kept == {"flow"}
@@ -470,11 +468,11 @@ def test_stream_of_pairs_resumes_exactly() -> None:
     for _ in range(5):
         next(stream)
     place = stream.get_state()
-    ahead = [next(stream)["seen"] for _ in range(4)]
+    ahead = [next(stream)["augmented"] for _ in range(4)]
     other = iter(pair_dataset(sources, (0.5, 0.5), settings, seed=3))
     other.set_state(place)
     for expected in ahead:
-        np.testing.assert_array_equal(next(other)["seen"], expected)
+        np.testing.assert_array_equal(next(other)["augmented"], expected)
     with pytest.raises(ValueError, match="positive share"):
         pair_dataset(sources, (1.0,), settings, seed=0)
 
@@ -528,7 +526,7 @@ def test_drawn_pairs_go_on_where_drawing_was_interrupted(tmp_path: Path, monkeyp
 
 def batch(count: int = 2, seed: int = 0) -> list[dict[str, np.ndarray]]:
     pictures = smooth_pictures(2 * count, 32, 32, seed).reshape(count, 2, 32, 32, 3)
-    return [{"clean": pair, "seen": pair} for pair in pictures]
+    return [{"clean": pair, "augmented": pair} for pair in pictures]
 
 
 @pytest.mark.ci
@@ -562,7 +560,10 @@ def test_a_recurrent_network_learns_by_its_sequence_beyond_the_crop() -> None:
     optimizer = optax.adam(1e-3)
     network = eqx.filter_jit(lambda: RAFTSmall(updates=2, levels=1, radius=1))()
     samples = [
-        {"clean": np.pad(sample["clean"], ((0, 0), (8, 8), (8, 8), (0, 0)), mode="reflect"), "seen": sample["seen"]}
+        {
+            "clean": np.pad(sample["clean"], ((0, 0), (8, 8), (8, 8), (0, 0)), mode="reflect"),
+            "augmented": sample["augmented"],
+        }
         for sample in batch()
     ]
     state = FlowTrainState.create(network, optimizer, seed=0)

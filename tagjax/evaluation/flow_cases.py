@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
 from ..flow.flo_files import read_flo
+from ..flow.image_sequences import open_sequence
 from ..flow.images import check_images
-from ..flow.picture_pairs import open_sequence
 from ..recording import RecordingError
 from ..recording.store import open_recording
 from ..sim.flow_pairs import FlowPairSettings, flow_pairs

@@ -17,10 +17,11 @@ from rich.table import Table
 
 from ..core.machine import machine
 from ..core.settings import build
+from ..flow.augmentation import AugmentationSettings
 from ..flow.estimates import NetworkFlow, forward_flow
+from ..flow.image_sequences import open_sequence
 from ..flow.losses import FlowLossSettings
 from ..flow.network import AbstractFlowNetwork
-from ..flow.picture_pairs import AugmentationSettings, open_sequence
 from ..flow.registry import make_flow
 from ..flow.weights import load_weights, save_weights
 from ..metrics.flow import FlowScores

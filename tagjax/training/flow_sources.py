@@ -17,14 +17,9 @@ from jaxtyping import UInt8
 from ..core.array_cache import cached_array, write_rows
 from ..core.stream import Stream
 from ..core.types import LazyArray
-from ..flow.picture_pairs import (
-    AugmentationSettings,
-    PairSource,
-    StackedPairs,
-    TeacherPairs,
-    open_sequence,
-    pair_dataset,
-)
+from ..flow.augmentation import AugmentationSettings
+from ..flow.image_pairs import PairSource, StackedPairs, TeacherPairs, pair_dataset
+from ..flow.image_sequences import open_sequence
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.textures import PHOTOGRAPHS, photograph
 from .flow_teacher import cut_pairs, taught_flow
@@ -171,7 +166,7 @@ def flow_dataset(
             StackedPairs(pairs) if settings.teacher is None else _taught(pairs, settings, settings.teacher, progress)
         )
         shares.append(1 - whole if sequences else 1.0)
-    return pair_dataset(sources, shares, settings.variation, seed=seed, workers=settings.workers, share=share)
+    return pair_dataset(sources, shares, settings.variation, seed=seed, workers=settings.workers, shard=share)
 
 
 def _taught(pairs: LazyArray | np.ndarray, settings: FlowDataSettings, teacher: str, progress: bool) -> TeacherPairs:

@@ -135,7 +135,7 @@ def _update(
     average_over: float,
     teach: bool,
 ) -> tuple[FlowTrainState, dict[str, Array]]:
-    clean, seen = (samples[name].astype(jnp.float32) / 255 for name in ("clean", "seen"))
+    clean, seen = (samples[name].astype(jnp.float32) / 255 for name in ("clean", "augmented"))
     learnable, rest = eqx.partition(state.network, eqx.is_inexact_array)
 
     def loss(learnable: PyTree) -> tuple[Array, dict[str, Array]]:
