@@ -31,7 +31,7 @@ from tagjax.core.settings import build
 from tagjax.flow.cache import pair_flow
 from tagjax.flow.estimates import NetworkFlow, consistency, estimate, flow_along, forward_flow, padding
 from tagjax.flow.images import check_images, to_uint8
-from tagjax.flow.losses import occluded
+from tagjax.flow.loss_terms import occluded
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.registry import CLASSICAL, VARIANTS, flow_key, make_flow

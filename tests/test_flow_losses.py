@@ -12,23 +12,25 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from tagjax.flow._layers import enlarge_flow
-from tagjax.flow.losses import (
-    FlowLossSettings,
+from tagjax.flow.loss_terms import (
     charbonnier,
     consistency_error_px2,
     crop_margin_px,
+    inside,
+    occluded,
+    self_supervision_term,
+    smoothness,
+    ssim_distance,
+)
+from tagjax.flow.losses import (
+    FlowLossSettings,
     data_distance,
     data_term,
     distillation_term,
-    inside,
     level_terms,
-    occluded,
-    self_supervision_term,
     sequence_terms,
-    shown,
-    smoothness,
-    ssim_distance,
-    weighted,
+    total_loss,
+    visible_mask,
 )
 from tagjax.image.census import GREY, census_distance, census_offsets, ternary, to_grey
 
@@ -287,15 +289,15 @@ def test_hiding_begins_when_it_is_told_to_and_has_no_gradient():
     forward, backward, covered = (jnp.asarray(each) for each in _curtain())
     settings = FlowLossSettings()
     on, off = jnp.ones(()), jnp.zeros(())
-    np.testing.assert_array_equal(shown(forward, backward, off, settings), np.ones((24, 40)))
-    np.testing.assert_array_equal(shown(forward, backward, on, settings), ~np.asarray(covered))
+    np.testing.assert_array_equal(visible_mask(forward, backward, off, settings), np.ones((24, 40)))
+    np.testing.assert_array_equal(visible_mask(forward, backward, on, settings), ~np.asarray(covered))
     never = dataclasses.replace(settings, occlusion=False)
-    np.testing.assert_array_equal(shown(forward, backward, on, never), np.ones((24, 40)))
+    np.testing.assert_array_equal(visible_mask(forward, backward, on, never), np.ones((24, 40)))
     # What leaves for the margin has no way back to check.
     leaving = _flow(24, 40, 5.0)
-    assert float(jnp.sum(1 - shown(leaving, _flow(24, 40), on, settings, 5))) == 24 * 35
-    assert float(jnp.sum(shown(leaving, -leaving, on, settings))) == 24 * 35
-    for gradient in jax.grad(lambda f, b: jnp.sum(shown(f, b, on, settings)), argnums=(0, 1))(forward, backward):
+    assert float(jnp.sum(1 - visible_mask(leaving, _flow(24, 40), on, settings, 5))) == 24 * 35
+    assert float(jnp.sum(visible_mask(leaving, -leaving, on, settings))) == 24 * 35
+    for gradient in jax.grad(lambda f, b: jnp.sum(visible_mask(f, b, on, settings)), argnums=(0, 1))(forward, backward):
         assert float(jnp.abs(gradient).max()) == 0
 
 
@@ -427,7 +429,7 @@ def test_the_terms_are_summed_over_levels_by_their_weights():
     for level, (weight, flow, back, one, other) in enumerate(
         ((1.0, forward[2], backward[2], first, second), (0.5, forward[1], backward[1], *map(jnp.asarray, small)))
     ):
-        visible = shown(flow, back, jnp.ones(()), SETTINGS)
+        visible = visible_mask(flow, back, jnp.ones(()), SETTINGS)
         warped = np.stack(
             [
                 map_coordinates(
@@ -447,9 +449,9 @@ def test_the_terms_are_summed_over_levels_by_their_weights():
     assert float(found["data"]) == pytest.approx(expected, rel=1e-4)
     assert float(found["smooth_first"]) == pytest.approx(float(smoothness(forward[1], jnp.asarray(small[0]), 50.0, 1)))
     assert float(found["occluded_fraction"]) == pytest.approx(
-        1 - float(shown(forward[2], backward[2], jnp.ones(()), SETTINGS).mean())
+        1 - float(visible_mask(forward[2], backward[2], jnp.ones(()), SETTINGS).mean())
     )
-    total = weighted({**found, "teaching": jnp.asarray(2.0)}, SETTINGS)
+    total = total_loss({**found, "self_supervision": jnp.asarray(2.0)}, SETTINGS)
     parts = (found["data"], found["smooth_first"], 0.3 * found["smooth_second"], 0.2 * 2.0)
     assert float(total) == pytest.approx(sum(map(float, parts)), rel=1e-6)
 
@@ -475,7 +477,7 @@ def test_the_whole_loss_has_the_gradient_of_its_parts(gradients_agree):
     def loss(flow):
         pictures = (jnp.asarray(each, flow.dtype) for each in (first, second))
         back = tuple(jnp.asarray(each, flow.dtype) for each in backward)
-        return weighted(_terms((flow,), back, *pictures), SETTINGS)
+        return total_loss(_terms((flow,), back, *pictures), SETTINGS)
 
     gradients_agree(jax.jit(loss), (_uneven(8, 8, seed=8),), atol=1e-5)
 

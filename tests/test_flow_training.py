@@ -631,7 +631,7 @@ def test_teacher_is_heard_late_and_then_ramped() -> None:
     pictures = jnp.asarray(dark * np.asarray([1.0, 0.5], np.float32).reshape(1, 2, 1, 1, 1))
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     teaching = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=True)[1]["teaching"])
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=True)[1]["self_supervision"])
         for step in (10, 15, 20, 40)
     ]
     # Backward, the student is two pixels off in one of two axes where the teacher is sure; forward it is right.

@@ -1,5 +1,5 @@
-"""Flows by name: `zero`, OpenCV's, and networks with their weights; any of them smoothed by how far its two ways agree,
-or at rest where rest explains the pictures as well; and the flow along a video.
+"""Flows by name: `zero`, OpenCV's, and networks with weights; optionally smoothed (`+wls`) or zero where the scene is
+stationary (`+rest`).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from . import opencv, wls
 from .estimates import NetworkFlow, consistency, flow_along
 from .images import check_images, to_float
 from .opencv import FlowFunction
-from .stationary import BLOCK_PX, GAIN, GENTLE_BLOCK_PX, GENTLE_GAIN, zero_stationary
-from .weights import find_weights, load_network, packaged_weights, weights_metadata
+from .stationary import BLOCK_PX, GAIN, MILD_BLOCK_PX, MILD_GAIN, zero_stationary
+from .weights import SUFFIX, find_weights, load_network, packaged_weights, weights_metadata
 from .wls import weighted_least_squares
 
 
 class ZeroFlow:
-    """No motion anywhere: what every flow has to beat."""
+    """Zero flow, the trivial baseline."""
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         one, _ = check_images(first, second)
@@ -34,23 +34,23 @@ class ZeroFlow:
 
 
 class ZeroStationaryFlow:
-    """Another flow, zero where rest explains the pictures as well (`zero_stationary`, gently): for a camera that stands."""
+    """Another flow, set to zero at stationary pixels (`zero_stationary` with mild settings), for a static camera."""
 
     def __init__(self, flow: FlowFunction):
         self.flow = flow
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         return zero_stationary(
-            np.asarray(self.flow(first, second)), first, second, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX
+            np.asarray(self.flow(first, second)), first, second, gain=MILD_GAIN, block_px=MILD_BLOCK_PX
         )
 
-    def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Flow forward and backward between neighbouring pictures, as `flow_along` of the other gives it."""
-        return zero_stationary_along(self.flow, pictures, gain=GENTLE_GAIN, block_px=GENTLE_BLOCK_PX)
+    def along(self, images: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Forward and backward flow of consecutive images."""
+        return zero_stationary_along(self.flow, images, gain=MILD_GAIN, block_px=MILD_BLOCK_PX)
 
 
 class SmoothedFlow:
-    """Another flow, smoothed within the pictures' edges by how far the ways there and back agree (`tagjax.flow.wls`)."""
+    """Another flow, smoothed within image edges with its forward-backward consistency as weights (`tagjax.flow.wls`)."""
 
     def __init__(self, flow: FlowFunction):
         self.flow = flow
@@ -59,54 +59,54 @@ class SmoothedFlow:
         ((forward, backward),) = flow_along(self.flow, (first, second))
         return _smoothed(forward, backward, first)
 
-    def along(self, pictures: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Flow forward and backward between neighbouring pictures, each of the other's ways asked for once."""
-        for (forward, backward), (one, other) in _with_pictures(self.flow, pictures):
+    def along(self, images: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Forward and backward flow of consecutive images; each direction is computed once."""
+        for (forward, backward), (one, other) in _with_images(self.flow, images):
             yield _smoothed(forward, backward, one), _smoothed(backward, forward, other)
 
 
-def _with_pictures(
-    flow: FlowFunction, pictures: Iterable[np.ndarray]
+def _with_images(
+    flow: FlowFunction, images: Iterable[np.ndarray]
 ) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]]:
-    """`flow_along`, each pair's flow with its two pictures."""
-    pictures, again = itertools.tee(pictures)
-    return zip(flow_along(flow, pictures), itertools.pairwise(again), strict=True)
+    """`flow_along`, the flow of each pair with its two images."""
+    images, again = itertools.tee(images)
+    return zip(flow_along(flow, images), itertools.pairwise(again), strict=True)
 
 
 @jax.jit
-def _smoothed_by_agreement(
+def _smooth_by_consistency(
     flow_px: Float[Array, "height width 2"],
     back_px: Float[Array, "height width 2"],
-    picture: Float[Array, "height width 3"],
+    image: Float[Array, "height width 3"],
 ) -> Float[Array, "height width 2"]:
-    return weighted_least_squares(flow_px, consistency(flow_px, back_px), picture)
+    return weighted_least_squares(flow_px, consistency(flow_px, back_px), image)
 
 
-def _smoothed(flow_px: np.ndarray, back_px: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    picture, _ = check_images(picture, picture)
-    return np.asarray(_smoothed_by_agreement(*map(jnp.asarray, (flow_px, back_px, to_float(picture)))))
+def _smoothed(flow_px: np.ndarray, back_px: np.ndarray, image: np.ndarray) -> np.ndarray:
+    image, _ = check_images(image, image)
+    return np.asarray(_smooth_by_consistency(*map(jnp.asarray, (flow_px, back_px, to_float(image)))))
 
 
 CLASSICAL: dict[str, Callable[[], FlowFunction]] = {"zero": ZeroFlow, **opencv.FLOWS}
-"""Flows that learn nothing, by name."""
+"""Flows without weights, by name."""
 
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "pyramid_mid": ("pyramid", {"octaves": (-1, 0, 1), "medians": 2}),
     "pyramid_fine": ("pyramid", {"octaves": (-1, 0, 1, 2), "medians": 2}),
 }
-"""Packaged weights with other settings of their network, by name; `<name>:<weights.safetensors>` has a file's weights in their place."""
+"""Packaged weights with other settings of their network, by name; `<name>:<weights.safetensors>` takes a file's weights."""
 
 _UNTRAINED = ("flownet_s", "flownet_c", "raft_small")
 
 SUFFIXES: dict[str, tuple[Callable[[FlowFunction], FlowFunction], str]] = {
     "+wls": (SmoothedFlow, wls.settings_key()),
-    "+rest": (ZeroStationaryFlow, f"{GENTLE_GAIN:g}-{GENTLE_BLOCK_PX}"),
+    "+rest": (ZeroStationaryFlow, f"{MILD_GAIN:g}-{MILD_BLOCK_PX}"),
 }
-"""What may follow a flow's name, one after the other: what it makes of the flow before it, and a key of its settings."""
+"""Suffixes of a flow's name: the wrapper of the flow, and a key of the wrapper's settings."""
 
 
 def split_suffixes(name: str) -> tuple[str, str]:
-    """A flow's name without its `SUFFIXES`, and those, or nothing."""
+    """A flow's name without its `SUFFIXES`, and the suffixes (or an empty string)."""
     bare = name
     while (last := _last_suffix(bare)) is not None:
         bare = bare.removesuffix(last)
@@ -118,10 +118,10 @@ def _last_suffix(name: str) -> str | None:
 
 
 def make_flow(name: str) -> FlowFunction:
-    """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of a .safetensors of weights.
+    """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of a weights file.
 
-    `pyramid_fine:<weights.safetensors>` is a variant with the weights of a file, such as fine-tuned ones. With `SUFFIXES` after
-    it, in that order applied. Raises `ValueError` for a name that is none of these, and for weights that cannot be used.
+    `pyramid_fine:<weights.safetensors>` is a variant with the weights of a file, such as fine-tuned ones. `SUFFIXES` may
+    follow and are applied in that order. Raises `ValueError` for any other name, and for weights that cannot be used.
     """
     if (suffix := _last_suffix(name)) is not None:
         return SUFFIXES[suffix][0](make_flow(name.removesuffix(suffix)))
@@ -132,9 +132,9 @@ def make_flow(name: str) -> FlowFunction:
 
 
 def flow_key(name: str) -> str:
-    """A name for what `make_flow(name)` computes that is a file name, too: weights go by their digest.
+    """A file name that identifies the result of `make_flow(name)`: other weights or settings have another key.
 
-    Other weights have another key, wherever they lie, and so have other settings. Errors as of `make_flow`.
+    Weights are identified by the digest of their file, not by its path. Errors as of `make_flow`.
     """
     if (suffix := _last_suffix(name)) is not None:
         return f"{flow_key(name.removesuffix(suffix))}{suffix}-{SUFFIXES[suffix][1]}"
@@ -150,10 +150,10 @@ def flow_key(name: str) -> str:
 
 
 def zero_stationary_along(
-    flow: FlowFunction, pictures: Iterable[np.ndarray], *, gain: float = GAIN, block_px: int = BLOCK_PX
+    flow: FlowFunction, images: Iterable[np.ndarray], *, gain: float = GAIN, block_px: int = BLOCK_PX
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """`flow_along`, zero where rest explains the pictures as well (`zero_stationary`)."""
-    for (forward, backward), (one, other) in _with_pictures(flow, pictures):
+    """`flow_along`, set to zero at stationary pixels (`zero_stationary`)."""
+    for (forward, backward), (one, other) in _with_images(flow, pictures):
         yield (
             zero_stationary(forward, one, other, gain=gain, block_px=block_px),
             zero_stationary(backward, other, one, gain=gain, block_px=block_px),
@@ -161,7 +161,7 @@ def zero_stationary_along(
 
 
 def _variant(name: str) -> tuple[str | None, str]:
-    """The variant that a name is, if any, and whose weights it has: packaged ones, or a file's."""
+    """The variant that a name selects, if any, and its weights: a packaged name, or the path of a file."""
     variant, _, source = name.partition(":")
     if variant not in VARIANTS:
         return None, name
@@ -170,24 +170,24 @@ def _variant(name: str) -> tuple[str | None, str]:
 
 def _weights(name: str) -> Path:
     variant, source = _variant(name)
-    if variant is not None or source.endswith(".safetensors") or source in packaged_weights():
+    if variant is not None or source.endswith(SUFFIX) or source in packaged_weights():
         return find_weights(source)
-    there = ", ".join(packaged_weights()) or "none"
+    available = ", ".join(packaged_weights()) or "none"
     if name in _UNTRAINED:
         raise ValueError(
-            f"The network {name!r} comes without weights (there are: {there}). Train it, `python -m experiments.train_flow "
+            f"The network {name!r} has no packaged weights (packaged are: {available}). Train it, `python -m experiments.train_flow "
             f"flow={name}`, and give <run>/weights.safetensors as the flow."
         )
     raise ValueError(
-        f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({there}), "
-        f"the path of a .safetensors file of weights, or <variant>:<path>; {' and '.join(SUFFIXES)} may follow."
+        f"Unknown optical flow {name!r}; expected one of {', '.join((*CLASSICAL, *VARIANTS))}, packaged weights ({available}), "
+        f"the path of a .safetensors file, or <variant>:<path>; {' and '.join(SUFFIXES)} may follow."
     )
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """What changes with a file's content."""
-    about = path.stat()
-    return about.st_mtime_ns, about.st_size
+    """Time and size of a file, which change with its content."""
+    status = path.stat()
+    return status.st_mtime_ns, status.st_size
 
 
 @functools.lru_cache(maxsize=4)

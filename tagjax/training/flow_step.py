@@ -12,16 +12,8 @@ import optax
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from ..core.compilation import large_program
-from ..flow.losses import (
-    FlowLossSettings,
-    crop_margin_px,
-    distillation_term,
-    level_terms,
-    occluded,
-    self_supervision_term,
-    sequence_terms,
-    weighted,
-)
+from ..flow.loss_terms import crop_margin_px, occluded, self_supervision_term
+from ..flow.losses import FlowLossSettings, distillation_term, level_terms, sequence_terms, total_loss
 from ..flow.network import AbstractFlowNetwork, Levels, flow_both_ways
 from .devices import check_batch, copied, spread
 
@@ -61,7 +53,7 @@ def pair_terms(
     forward, backward = flow_both_ways(network, seen[0], seen[1])
     terms = terms_both_ways(forward, backward, clean, seen.shape[1:3], hide, settings)
     if not teach:
-        return {**terms, "teaching": jnp.zeros(())}
+        return {**terms, "self_supervision": jnp.zeros(())}
     border = settings.self_supervision_border_px
     small = seen[:, border:-border, border:-border]
     there, back = flow_both_ways(network, small[0], small[1])
@@ -71,7 +63,7 @@ def pair_terms(
         )
         for mine, other, whole, whole_other in ((there, back, forward, backward), (back, there, backward, forward))
     ]
-    return {**terms, "teaching": (parts[0] + parts[1]) / 2}
+    return {**terms, "self_supervision": (parts[0] + parts[1]) / 2}
 
 
 def terms_both_ways(
@@ -107,8 +99,8 @@ def batch_loss(
     found = jax.tree.map(jnp.mean, one(clean, seen))
     begun = (step - settings.self_supervision_after).astype(jnp.float32)
     ramp = jnp.clip(begun / max(settings.self_supervision_ramp, 1), 0.0, 1.0)
-    found["teaching"] = ramp * found["teaching"]
-    return weighted(found, settings), found
+    found["self_supervision"] = ramp * found["self_supervision"]
+    return total_loss(found, settings), found
 
 
 def imitation_loss(

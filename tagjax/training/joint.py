@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, UInt8
 
 from ..core.settings import ConfigError
 from ..flow.estimates import padding
-from ..flow.losses import FlowLossSettings, weighted
+from ..flow.losses import FlowLossSettings, total_loss
 from ..flow.network import AbstractFlowNetwork, flow_both_ways
 from ..flow.stationary import is_moving
 from ..flow.weights import save_weights
@@ -85,7 +85,7 @@ def network_flow(
     first = jnp.zeros_like(forward[:1])
     terms = jax.tree.map(jnp.mean, terms)
     flow = Flow(*(jnp.concatenate([first, way]) for way in (forward, backward)))
-    return flow, weighted(terms, settings), {f"flow/{name}": value for name, value in terms.items()}
+    return flow, total_loss(terms, settings), {f"flow/{name}": value for name, value in terms.items()}
 
 
 def _stride(frames: Frame) -> int:
