@@ -106,7 +106,7 @@ def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
     elif broken == "cut":
         for name in names:
             (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:60])
-        told = r"none of 2 pictures can be read. First: .*a\.png: the picture is cut short"
+        told = r"none of 2 pictures can be read. First: .*a\.png: the image is truncated"
     elif broken == "nothing":
         path, told = str(tmp_path / "nowhere"), "found nothing"
     else:

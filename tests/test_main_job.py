@@ -193,10 +193,10 @@ def test_label_pictures_are_whole_and_of_the_frames_size(tmp_path: Path) -> None
     second = tmp_path / "00000001.png"
     whole = second.read_bytes()
     second.write_bytes(whole[:-20])  # OpenCV reads this without a word
-    with pytest.raises(RecordingError, match=r"00000001\.png: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"00000001\.png: the image is truncated"):
         with_virtual_tags(recording, settings)
     cv2.imwrite(str(second), recording.truth.labels[1][:, :-1])
-    with pytest.raises(RecordingError, match=r"00000001\.png: a picture of \(24, 31\); expected \(24, 32\)"):
+    with pytest.raises(RecordingError, match=r"00000001\.png: an image of \(24, 31\); expected \(24, 32\)"):
         with_virtual_tags(recording, settings)
 
 
@@ -242,7 +242,7 @@ def test_reads_of_unlike_conventions_are_not_joined() -> None:
     both = join_reads([one, one[:3]])
     assert both.num_reads == one.num_reads + 3
     assert (both.time_ns[1:] >= both.time_ns[:-1]).all()
-    with pytest.raises(RecordingError, match="convert first"):
+    with pytest.raises(RecordingError, match="Convert them first"):
         join_reads([one, dataclasses.replace(TagReads.empty(), phase_sign=-1)])
 
 

@@ -21,7 +21,8 @@ from tagjax.flow import cache as flow_cache
 from tagjax.flow.cache import pair_flow
 from tagjax.flow.registry import make_flow
 from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads, Truth, store
-from tagjax.recording.store import StoredFrames, open_recording, save_recording, write_recording
+from tagjax.recording.store import open_recording, save_recording, write_recording
+from tagjax.recording.stored_frames import StoredFrames
 from tagjax.recording.time_reversal import time_reversed
 from tagjax.tracing.clips import load_clip
 from tagjax.training.clip_dataset import clip_dataset
@@ -358,7 +359,7 @@ def test_truncated_and_foreign_stores_are_refused(recording, tmp_path):
 
 def test_missing_depth_is_said_and_refused_where_it_is_needed(recording, tmp_path):
     flat = dataclasses.replace(recording, depth=np.zeros_like(recording.depth))
-    with pytest.warns(RecordingWarning, match="no depth at all: TagAttention cannot trace here"):
+    with pytest.warns(RecordingWarning, match="no depth at all: only systems that need no depth"):
         flat.check()
     flat.check(depth=False)
     save_recording(flat, tmp_path / "flat.zarr")
@@ -550,7 +551,7 @@ def test_true_flow_is_what_the_recording_holds(recording):
     np.testing.assert_array_equal(
         pair_flow(time_reversed(known), 7, 9, "truth")[0], pair_flow(known, 4, 6, "truth")[1][::-1]
     )
-    with pytest.raises(RecordingError, match="does not hold its true flow"):
+    with pytest.raises(RecordingError, match="has no true flow"):
         pair_flow(recording, 0, 2, "truth")
 
 

@@ -157,7 +157,7 @@ def test_what_follows_a_picture_and_what_precedes_it_does_not_matter(tmp_path):
         assert read_colour(path).shape == (HEIGHT, WIDTH, 3)
     # The end marker of a thumbnail in the header is not the picture's.
     path.write_bytes(with_thumbnail[: len(with_thumbnail) * 2 // 3])
-    with pytest.raises(RecordingError, match=r"a\.jpg: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"a\.jpg: the image is truncated"):
         read_colour(path)
 
 
@@ -167,10 +167,10 @@ def test_altered_and_foreign_pictures_are_errors(tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(bytes(data))
-    with pytest.raises(RecordingError, match=r"a\.png: the picture is cut short or damaged"):
+    with pytest.raises(RecordingError, match=r"a\.png: the image is truncated or damaged"):
         read_colour(path)
     path.write_text("no picture")
-    with pytest.raises(RecordingError, match=r"a\.png: no readable picture \(10 bytes\)"):
+    with pytest.raises(RecordingError, match=r"a\.png: no readable image \(10 bytes\)"):
         read_colour(path)
     with pytest.raises(RecordingError, match=r"b\.png: cannot be read"):
         read_colour(tmp_path / "b.png")
@@ -179,7 +179,7 @@ def test_altered_and_foreign_pictures_are_errors(tmp_path):
 def test_a_cut_picture_stops_the_import_before_it_is_in_a_recording(folder, importing, tmp_path):
     _cut(folder / "image002.jpg", 0.8)
     recording = importing()
-    with pytest.raises(RecordingError, match=r"image002\.jpg: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"image002\.jpg: the image is truncated"):
         recording.colour[1:4]
     with pytest.raises(RecordingError, match=r"image002\.jpg"):
         save_recording(recording, tmp_path / "a.zarr")
@@ -334,7 +334,7 @@ def test_tum_folders_that_cannot_be_used_are_errors(tmp_path):
     with pytest.raises(RecordingError, match="unknown TUM camera 'kinect'"):
         import_tum(folder, camera="kinect")
     _cut(folder / "rgb" / "2.000.png", 0.5)
-    with pytest.raises(RecordingError, match=r"2\.000\.png: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"2\.000\.png: the image is truncated"):
         import_tum(folder).colour[1]
     cv2.imwrite(str(folder / "depth" / "2.000.png"), np.zeros((480, 640), np.uint8))
     with pytest.raises(RecordingError, match=r"2\.000\.png: uint8 of shape"):

@@ -16,7 +16,7 @@ from zarr.storage import LocalStore
 
 from ..core.array_cache import compute_once
 from ..recording import Recording, RecordingError
-from ..recording.store import StoredFrames, create_array
+from ..recording.stored_frames import StoredFrames, create_array
 from .opencv import FlowFunction
 from .registry import flow_key, make_flow, zero_stationary_along
 
