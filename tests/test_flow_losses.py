@@ -258,7 +258,7 @@ def test_a_margin_of_nothing_is_no_margin():
 def test_margins_that_are_not_alike_are_refused():
     assert crop_margin_px((20, 30), (26, 36)) == 3
     for whole in ((26, 34), (25, 35), (18, 28)):
-        with pytest.raises(ValueError, match="equally far"):
+        with pytest.raises(ValueError, match="expected the same margin"):
             crop_margin_px((20, 30), whole)
 
 
@@ -486,7 +486,7 @@ def test_a_margin_must_fit_every_level():
     forward, first = _pyramid(), _colour()
     wide = _colour(38, 38, seed=3)
     _terms(forward[2:], forward[2:], first, wide)
-    with pytest.raises(ValueError, match=r"margin of 3 .* multiple of 2"):
+    with pytest.raises(ValueError, match=r"margin .* is 3 pixels; expected a multiple of 2"):
         _terms(forward, forward, first, wide)
 
 

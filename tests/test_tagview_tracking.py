@@ -198,13 +198,13 @@ def test_training_learns_and_weights_come_back(tmp_path):
 
 
 def test_foreign_weights_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="no weights"):
+    with pytest.raises(ValueError, match="no readable weights"):
         load_detector(tmp_path / "missing.safetensors")
     (tmp_path / "text.safetensors").write_text("hello")
-    with pytest.raises(ValueError, match="no weights"):
+    with pytest.raises(ValueError, match="no readable weights"):
         load_detector(tmp_path / "text.safetensors")
     np.savez(tmp_path / "other.npz", a=np.ones(3))
-    with pytest.raises(ValueError, match="no weights"):
+    with pytest.raises(ValueError, match="no readable weights"):
         load_detector(tmp_path / "other.npz")
     network = BoxNetwork((4, 6, 8), 1, key=jax.random.key(0))
     save_detector(tmp_path / "small.safetensors", network, {"network": {"widths": [4, 6, 9], "depth": 1}})
