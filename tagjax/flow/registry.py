@@ -153,7 +153,7 @@ def zero_stationary_along(
     flow: FlowFunction, images: Iterable[np.ndarray], *, gain: float = GAIN, block_px: int = BLOCK_PX
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """`flow_along`, set to zero at stationary pixels (`zero_stationary`)."""
-    for (forward, backward), (one, other) in _with_images(flow, pictures):
+    for (forward, backward), (one, other) in _with_images(flow, images):
         yield (
             zero_stationary(forward, one, other, gain=gain, block_px=block_px),
             zero_stationary(backward, other, one, gain=gain, block_px=block_px),
