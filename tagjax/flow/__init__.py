@@ -1,4 +1,4 @@
-"""Optical flow: networks, losses, estimates, weights, and named flows. `opencv` and `named` import cv2."""
+"""Optical flow: networks, losses, estimates, weights, and flows by name. `opencv` and `registry` import cv2."""
 
 from typing import TYPE_CHECKING, Any
 

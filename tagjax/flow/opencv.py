@@ -13,7 +13,7 @@ from .images import check_images, to_uint8
 FlowFunction: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(first, second), RGB uint8 (height, width, 3) each, to flow in pixels, float32 (height, width, 2) on `first`.
 
-Whatever else `check_images` takes is a picture, too.
+Other images that `check_images` accepts are converted.
 """
 
 DIS_PRESETS = {
@@ -22,12 +22,12 @@ DIS_PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 
-_SMALLEST = 16
-"""Pixels of a side below which pictures are enlarged by repeating the edge: OpenCV's DIS refuses fewer than 12."""
+_MIN_SIDE_PX = 16
+"""Shorter images are padded by their edge pixels: OpenCV's DIS refuses fewer than 12."""
 
 
 class DISFlow:
-    """Dense inverse search at one of OpenCV's presets: "ultrafast", "fast" or "medium"."""
+    """Dense inverse search at one of OpenCV's presets: "ultrafast", "fast" or "medium". Raises `ValueError` for others."""
 
     def __init__(self, preset: str = "medium"):
         if preset not in DIS_PRESETS:
@@ -66,9 +66,9 @@ def to_grey_uint8(colour: np.ndarray) -> np.ndarray:
 
 
 def _grey_pair(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both pictures, checked, in grey, and large enough."""
+    """Both images, checked, in grey, padded to the minimum side."""
     one, other = (to_grey_uint8(np.ascontiguousarray(to_uint8(picture))) for picture in check_images(first, second))
-    rows, columns = (max(0, _SMALLEST - size) for size in one.shape)
+    rows, columns = (max(0, _MIN_SIDE_PX - size) for size in one.shape)
     if rows or columns:
         one, other = (np.pad(picture, ((0, rows), (0, columns)), mode="edge") for picture in (one, other))
     return one, other
