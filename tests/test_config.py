@@ -115,9 +115,9 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"cell": 0}, r"tracer: cell is 0; expected a whole number of at least 1"),
+        ({"cell": 0}, r"tracer: cell is 0; expected an integer of at least 1"),
         ({"cell": 4.5}, r"tracer: "),  # beartype is first here
-        ({"beta": 2.0}, r"tracer: beta is 2\.0; expected a share from 0 to 1"),
+        ({"beta": 2.0}, r"tracer: beta is 2\.0; expected a fraction from 0 to 1"),
         ({"alpha_m2": -1.0}, r"tracer: alpha_m2 is -1\.0; expected a positive value"),
         ({"alpha_m2": float("nan")}, r"tracer: alpha_m2 is nan; expected a positive value"),
     ],

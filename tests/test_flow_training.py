@@ -106,7 +106,7 @@ def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
     elif broken == "cut":
         for name in names:
             (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:60])
-        told = r"none of 2 pictures can be read. First: .*a\.png: the image is truncated"
+        told = r"none of 2 images can be read. First: .*a\.png: the image is truncated"
     elif broken == "nothing":
         path, told = str(tmp_path / "nowhere"), "found nothing"
     else:
@@ -124,9 +124,16 @@ def test_bad_pictures_of_a_folder_are_named_when_it_is_opened(tmp_path: Path) ->
     for name, share in (("9.png", 0.9), ("11.jpg", 0.9), ("19.png", 0.0)):
         whole = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(RecordingError, match="4 of 20 pictures cannot be used; expected whole ones of 50 x 40") as told:
+    with pytest.raises(
+        RecordingError, match="4 of 20 images cannot be used; expected complete images of 50 x 40"
+    ) as told:
         open_sequence(str(tmp_path), tmp_path / "cache")
-    for words in ("0.png: 50 x 30 pix", "9.png: the picture is cut", "11.jpg: the picture is cut", "19.png: no read"):
+    for words in (
+        "0.png: 50 x 30 pix",
+        "9.png: the image is truncated",
+        "11.jpg: the image is truncated",
+        "19.png: no read",
+    ):
         assert words in str(told.value)
     for number in range(20):
         cv2.imwrite(str(tmp_path / f"{number}.bmp"), pictures[0][:30])
@@ -139,7 +146,7 @@ def test_a_picture_that_changes_after_opening_is_named(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
     folder = ImageFolder(tmp_path)
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((30, 50, 3), np.uint8))
-    with pytest.raises(RecordingError, match=r"1\.png has 50 x 30 pixels by now; all had 50 x 40"):
+    with pytest.raises(RecordingError, match=r"1\.png has 50 x 30 pixels now; all images had 50 x 40"):
         folder[1]
 
 
@@ -195,7 +202,7 @@ def test_video_is_read_to_its_end_whatever_it_says_of_its_length(
 
 def test_video_of_one_frame_is_refused_and_not_kept(tmp_path: Path) -> None:
     write_video(tmp_path / "film.avi", smooth_pictures(1, 32, 48))
-    with pytest.raises(RecordingError, match=r"film\.avi holds 1 picture"):
+    with pytest.raises(RecordingError, match=r"film\.avi holds 1 image"):
         open_sequence(str(tmp_path / "film.avi"), tmp_path / "cache")
     assert not (tmp_path / "cache").exists() or not list((tmp_path / "cache").iterdir())
 
@@ -342,7 +349,7 @@ def test_impossible_cuts_are_refused() -> None:
     pictures = np.zeros((3, 40, 48, 3), np.uint8)
     with pytest.raises(RecordingError, match="48 x 40 pixels; cuts for a student take 64 x 32"):
         cut_pairs(pictures, 2, (32, 64), (1,), seed=0)
-    with pytest.raises(RecordingError, match="No two of 3 pictures are 4 frames apart"):
+    with pytest.raises(RecordingError, match="No two of 3 images are 4 frames apart"):
         cut_pairs(pictures, 2, (32, 32), (4,), seed=0)
 
 
@@ -473,7 +480,7 @@ def test_stream_of_pairs_resumes_exactly() -> None:
     other.set_state(place)
     for expected in ahead:
         np.testing.assert_array_equal(next(other)["augmented"], expected)
-    with pytest.raises(ValueError, match="positive share"):
+    with pytest.raises(ValueError, match="positive weight"):
         pair_dataset(sources, (1.0,), settings, seed=0)
 
 

@@ -150,9 +150,9 @@ def test_an_estimate_is_the_same_every_time(estimated) -> None:
 
 def test_a_room_in_which_nothing_moves_cannot_tell() -> None:
     colour, depth = Room(0, num_moving=0).frames(range(6), _told())
-    with pytest.raises(RecordingError, match="somebody walks"):
+    with pytest.raises(RecordingError, match="a person walks"):
         estimate_correction(colour, depth, _told())
-    with pytest.raises(RecordingError, match="Only 0 of 0 moving things"):
+    with pytest.raises(RecordingError, match="Only 0 of 0 moving objects"):
         misalignment_px(colour, depth, _told())
 
 
