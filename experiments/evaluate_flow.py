@@ -1,7 +1,7 @@
 """Evaluate optical flows side by side: drawn pairs, recordings with exact flow, Middlebury's scenes, any video.
 
 python -m experiments.evaluate_flow 'flows=[zero,dis,pyramid]'
-python -m experiments.evaluate_flow 'flows=[dis,outputs/train_flow/<time>/weights.npz]' 'recordings=[a.zarr,b.zarr]'
+python -m experiments.evaluate_flow 'flows=[dis,outputs/train_flow/<time>/weights.safetensors]' 'recordings=[a.zarr,b.zarr]'
 python -m experiments.evaluate_flow 'flows=[dis,pyramid]' num_pairs=0 'folders=[middlebury]' 'sequences=[my_video.mp4]'
 """
 

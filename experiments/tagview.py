@@ -3,7 +3,7 @@
 python -m experiments.simulate suite=ceiling_2         # and ceiling_3 to ceiling_6, separated_traces, half_wavelength
 python -m experiments.tagview
 python -m experiments.tagview max_recordings=4 'suites=[ceiling_4]' system.detector.kind=motion
-python -m experiments.tagview command=train            # writes detector.npz to the run folder
+python -m experiments.tagview command=train            # writes detector.safetensors to the run folder
 python -m experiments.tagview system.detector.weights=<file>
 """
 

@@ -11,7 +11,7 @@ import pytest
 from radio_environments import box_room, free_space, infinite_planes, point_scatterers
 from scipy.optimize import fminbound, minimize
 
-from tagjax.radio.noise import pi_flip_share
+from tagjax.radio.noise import estimate_flip_probability
 from tagjax.radio.reader import HOP_TABLES_HZ, ReaderState
 from tagjax.recording.importers.clock import audit_clocks
 from tagjax.recording.virtual_tags import Track
@@ -448,7 +448,8 @@ def test_pi_flips_have_their_probability(probability):
     """0.06 to 0.12 of the reads give the 11 to 21 % of transitions that logs show (rfid-facts 1.4)."""
     settings = dataclasses.replace(PLAIN, flip_probability=probability)
     reads = simulate_inventory(still([[0.0, 0.0, 1.0]], 120.0), AT_ORIGIN, free_space(), settings, seed=0).reads
-    assert abs(pi_flip_share(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index) - probability) < 0.012
+    estimate = estimate_flip_probability(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index)
+    assert abs(estimate - probability) < 0.012
     assert reads.pi_flips == (probability > 0)
 
 

@@ -16,7 +16,7 @@ import synthetic_clips as synthetic
 from tagjax.core.numerics import SPEED_OF_LIGHT_M_S
 from tagjax.core.settings import ConfigError
 from tagjax.recording import Recording, RecordingError, RecordingWarning, TagReads
-from tagjax.recording.opening import VirtualTagSettings
+from tagjax.recording.loading import VirtualTagSettings
 from tagjax.recording.reads import join_reads
 from tagjax.tracing.clips import ClipSettings, choose_antennas, load_clip
 from tagjax.training.clip_dataset import clip_dataset, motion_heard

@@ -19,7 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.suites import suites_named
-from tagjax.baselines.goller import AntennaModel, Calibration, GollerTracer, make_association, make_location, save_calibration
+from tagjax.baselines.goller import (
+    AntennaModel,
+    Calibration,
+    GollerTracer,
+    make_association,
+    make_location,
+    save_calibration,
+)
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
 from tagjax.evaluation.compare._run import _score, _Tally

@@ -19,7 +19,7 @@ from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.run import EvaluateConfig
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.metrics.recordings import ScoreSettings
-from tagjax.recording.opening import VirtualTagSettings
+from tagjax.recording.loading import VirtualTagSettings
 from tagjax.tracing.clips import ClipSettings
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_sources import FlowDataSettings
@@ -124,9 +124,9 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"cell": 0}, r"tracer: cell is 0; expected a whole number of at least 1"),
+        ({"cell": 0}, r"tracer: cell is 0; expected an integer of at least 1"),
         ({"cell": 4.5}, r"tracer: "),  # beartype is first here
-        ({"beta": 2.0}, r"tracer: beta is 2\.0; expected a share from 0 to 1"),
+        ({"beta": 2.0}, r"tracer: beta is 2\.0; expected a fraction from 0 to 1"),
         ({"alpha_m2": -1.0}, r"tracer: alpha_m2 is -1\.0; expected a positive value"),
         ({"alpha_m2": float("nan")}, r"tracer: alpha_m2 is nan; expected a positive value"),
     ],

@@ -29,12 +29,12 @@ state = FlowTrainState.create(network, optimizer, seed=0)
 settings = FlowLossSettings(data="photometric", occlusion=False)
 losses, refused = [], ""
 for _ in range(3):
-    state, numbers = flow_step(state, [{"clean": p, "seen": p} for p in pairs], optimizer, settings, 10.0)
+    state, numbers = flow_step(state, [{"clean": p, "augmented": p} for p in pairs], optimizer, settings, 10.0)
     losses.append(numbers["loss"])
 weight = np.asarray(state.network.upsampler.weight).ravel().tolist()
 where = len(state.network.upsampler.weight.sharding.device_set)
 try:
-    flow_step(state, [{"clean": p, "seen": p} for p in pairs[:6]], optimizer, settings, 10.0)
+    flow_step(state, [{"clean": p, "augmented": p} for p in pairs[:6]], optimizer, settings, 10.0)
 except ValueError as error:
     refused = str(error)
 print(json.dumps({"losses": losses, "weight": weight, "devices": jax.device_count(), "where": where, "refused": refused}))

@@ -103,7 +103,7 @@ def test_two_processes_learn_flow_as_one_does(tmp_path: Path) -> None:
         assert theirs["gradient_norm"] == pytest.approx(mine["gradient_norm"], rel=2e-4)
     for mine, theirs in zip(rows[5:16], others[5:16], strict=True):
         assert theirs["loss"] == pytest.approx(mine["loss"], rel=0.01)
-    assert (first / "weights.npz").is_file()
+    assert (first / "weights.safetensors").is_file()
     assert {path.name for path in second.iterdir()} <= {"config.yaml", ".hydra", "train_flow.log"}
 
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import io
 import itertools
 import json
-import pickle
 import threading
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors
+import safetensors.numpy
 import synthetic_clips as synthetic
 import yaml
 from hydra import compose, initialize_config_dir
@@ -27,17 +26,17 @@ from jaxtyping import Array, Float
 import tagjax.flow
 import tagjax.flow.estimates
 import tagjax.flow.weights
-from tagjax.core.arrays_file import named_arrays
+from tagjax.core.array_file import named_arrays
 from tagjax.core.build import build
 from tagjax.flow.cache import pair_flow
-from tagjax.flow.estimates import NetworkFlow, agreement, estimate, flow_along, one_way, padding
-from tagjax.flow.losses import occluded
-from tagjax.flow.named import CLASSICAL, VARIANTS, flow_key, make_flow
+from tagjax.flow.estimates import NetworkFlow, consistency, estimate, flow_along, forward_flow, padding
+from tagjax.flow.images import check_images, to_uint8
+from tagjax.flow.loss_terms import occluded
 from tagjax.flow.network import AbstractFlowNetwork
-from tagjax.flow.pictures import as_bytes, check_pictures
 from tagjax.flow.pyramid import PyramidFlow
-from tagjax.flow.stillness import settled
-from tagjax.flow.weights import load_network, load_weights, save_weights, weights_about
+from tagjax.flow.registry import CLASSICAL, VARIANTS, flow_key, make_flow
+from tagjax.flow.stationary import zero_stationary
+from tagjax.flow.weights import load_network, load_weights, save_weights, weights_metadata
 from tagjax.recording.store import open_recording, save_recording
 from tagjax.tracing.clips import load_clip
 
@@ -103,15 +102,15 @@ def test_every_kind_of_picture_becomes_the_same_rgb():
     grey = texture(9, 12)[..., 0]
     rgb = np.repeat(grey[..., None], 3, axis=-1)
     for same in (grey, grey[..., None], rgb, np.dstack([rgb, grey])):
-        for one in check_pictures(same, rgb):
+        for one in check_images(same, rgb):
             np.testing.assert_array_equal(one, rgb)
             assert one.dtype == np.uint8
     for same in (grey.astype(np.uint16) * 257, grey / 255, (grey / 255).astype(np.float16)):
-        first, second = check_pictures(same, rgb)
+        first, second = check_images(same, rgb)
         assert first.dtype == second.dtype == np.float32
         np.testing.assert_allclose(first, rgb / 255, atol=1e-3)
         np.testing.assert_allclose(second, rgb / 255, atol=1e-6)
-        np.testing.assert_array_equal(as_bytes(second), rgb)
+        np.testing.assert_array_equal(to_uint8(second), rgb)
 
 
 GOOD = np.zeros((8, 9, 3), np.uint8)
@@ -122,26 +121,26 @@ HOLED[2, 3] = np.nan
 @pytest.mark.parametrize(
     ("first", "second", "message"),
     [
-        (GOOD, None, "One picture is missing; a flow needs two"),
-        (GOOD, GOOD[:, :8], "9 x 8 and 8 x 8 pixels; a flow needs one size"),
+        (GOOD, None, "One image is missing; a flow needs two"),
+        (GOOD, GOOD[:, :8], "9 x 8 and 8 x 8 pixels; a flow needs equal sizes"),
         (GOOD, GOOD.transpose(2, 0, 1), r"shape \(3, 8, 9\).*Channels come last"),
-        (GOOD[None], GOOD[None], "Give one picture at a time"),
-        (GOOD[..., :2], GOOD, r"shape \(8, 9, 2\); expected a grey or RGB picture"),
-        (HOLED, GOOD, "The first picture holds 1 values that are not finite"),
-        (GOOD, HOLED + np.inf, "The second picture holds 72 values"),
-        (GOOD.astype(float) + 255, GOOD, "from 255 to 255; floats count from 0 to 1"),
-        (GOOD.astype(float) - 1, GOOD, "from -1 to -1; floats count"),
+        (GOOD[None], GOOD[None], "Give one image at a time"),
+        (GOOD[..., :2], GOOD, r"shape \(8, 9, 2\); expected a grey or RGB image"),
+        (HOLED, GOOD, "The first image holds 1 values that are not finite"),
+        (GOOD, HOLED + np.inf, "The second image holds 72 values"),
+        (GOOD.astype(float) + 255, GOOD, "from 255 to 255; expected floats from 0 to 1"),
+        (GOOD.astype(float) - 1, GOOD, "from -1 to -1; expected floats"),
         (GOOD.astype(np.int32), GOOD, "int32; expected"),
         (GOOD.astype(bool), GOOD, "bool; expected"),
         (GOOD[:0], GOOD, "is empty"),
-        ("a.png", GOOD, "expected a grey or RGB picture"),
-        ([[1, 2], [3]], GOOD, "expected a grey or RGB picture"),
+        ("a.png", GOOD, "expected a grey or RGB image"),
+        ([[1, 2], [3]], GOOD, "expected a grey or RGB image"),
     ],
 )
 def test_what_is_no_pair_of_pictures_is_refused(first, second, message):
     arrays = isinstance(first, np.ndarray) and isinstance(second, np.ndarray)
     flows = (make_flow("zero"), make_flow("dis_ultrafast"), NetworkFlow(PAINTED)) if arrays else ()
-    for flow in (check_pictures, lambda *pair: estimate(PAINTED, *pair), *flows):
+    for flow in (check_images, lambda *pair: estimate(PAINTED, *pair), *flows):
         with pytest.raises(ValueError, match=message):
             flow(first, second)
 
@@ -183,7 +182,7 @@ def test_flow_is_cut_back_to_where_the_picture_lies(shape):
     found = estimate(PAINTED, first, second)
     np.testing.assert_allclose(found.forward_px, flow, atol=1e-4)
     np.testing.assert_allclose(found.backward_px, -flow[::-1], atol=1e-4)
-    np.testing.assert_allclose(one_way(PAINTED, first, second), flow, atol=1e-4)
+    np.testing.assert_allclose(forward_flow(PAINTED, first, second), flow, atol=1e-4)
     np.testing.assert_allclose(NetworkFlow(PAINTED)(first, second), flow, atol=1e-4)
     assert all(np.shape(leaf)[:2] == shape for leaf in jax.tree.leaves(found))
 
@@ -193,8 +192,8 @@ def test_sizes_share_what_is_compiled():
     network = Painted(divisor=24, scale_px=jnp.asarray(7.0))
     for shape in ((70, 70), (72, 72), (65, 71)):
         estimate(network, paint(0, *shape), paint(0, *shape))
-        one_way(network, paint(0, *shape), paint(0, *shape))
-    # By itself once, and twice in the whole of `one_way`.
+        forward_flow(network, paint(0, *shape), paint(0, *shape))
+    # By itself once, and twice in the whole of `forward_flow`.
     assert TRACED == 3 * [(72, 72, 3)]
     estimate(Painted(divisor=24, scale_px=jnp.asarray(8.0)), paint(0, 66, 66), paint(0, 66, 66))
     assert len(TRACED) == 3
@@ -224,7 +223,7 @@ def test_confidence_is_half_where_a_pixel_begins_to_be_hidden():
     flow = jnp.asarray(rng.uniform(-1, 1, (20, 30, 2)), jnp.float32)
     back = -flow + jnp.asarray(rng.uniform(-1.2, 1.2, (20, 30, 2)), jnp.float32)
     inner = (slice(2, -2), slice(2, -2))
-    confidence = agreement(flow, back)
+    confidence = consistency(flow, back)
     hidden = np.asarray(occluded(flow, back))[inner]
     np.testing.assert_array_equal(np.asarray(confidence)[inner] <= 0.5, hidden)
     assert 0.2 < hidden.mean() < 0.8
@@ -234,7 +233,7 @@ def test_confidence_is_half_where_a_pixel_begins_to_be_hidden():
 def test_confidence_has_the_gradient_of_its_formula(gradients_agree):
     rng = np.random.default_rng(3)
     flow = rng.uniform(0.1, 0.4, (4, 5, 2))
-    gradients_agree(lambda f, b: agreement(f, b), (flow, -flow + rng.uniform(-0.3, 0.3, (4, 5, 2))))
+    gradients_agree(lambda f, b: consistency(f, b), (flow, -flow + rng.uniform(-0.3, 0.3, (4, 5, 2))))
 
 
 class Wider(AbstractFlowNetwork):
@@ -270,8 +269,8 @@ def test_estimates_go_through_transformations():
     traced = eqx.filter_jit(estimate)(network, first, second)
     for one, other in zip(jax.tree.leaves(eager), jax.tree.leaves(traced), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4)
-    np.testing.assert_allclose(one_way(network, first, second), eager.forward_px, atol=1e-4)
-    gradient = eqx.filter_grad(lambda n: jnp.sum(one_way(n, first, second) ** 2))(network)
+    np.testing.assert_allclose(forward_flow(network, first, second), eager.forward_px, atol=1e-4)
+    gradient = eqx.filter_grad(lambda n: jnp.sum(forward_flow(n, first, second) ** 2))(network)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
     assert any(np.any(leaf != 0) for leaf in jax.tree.leaves(gradient))
 
@@ -340,21 +339,21 @@ def _same(one: Any, other: Any) -> None:
 
 
 def test_weights_come_back_with_what_is_told_of_them(tmp_path):
-    network, path = small_network(3), tmp_path / "new" / "a.npz"
+    network, path = small_network(3), tmp_path / "new" / "a.safetensors"
     about = {"flow": SETTINGS, "recipe": {"seed": 3, "sizes": (1, 2)}, "epe_px": np.float32(0.5), "data": ["a"]}
     save_weights(path, network, about)
     _same(load_network(path), network)
     _same(load_weights(small_network(4), str(path)), network)
-    told = weights_about(path)
+    told = weights_metadata(path)
     assert told["flow"] == SETTINGS
     assert told["recipe"] == {"seed": 3, "sizes": [1, 2]}
     assert told["epe_px"] == 0.5
-    again = tmp_path / "b.npz"
+    again = tmp_path / "b.safetensors"
     save_weights(again, network, about)
     assert again.read_bytes() == path.read_bytes()
-    assert [item.name for item in path.parent.iterdir()] == ["a.npz"]
-    with np.load(path, allow_pickle=False) as file:
-        np.testing.assert_array_equal(file["encoders.1.0.weight"], named_arrays(network)["encoders.1.0.weight"])
+    assert [item.name for item in path.parent.iterdir()] == ["a.safetensors"]
+    arrays = safetensors.numpy.load_file(path)
+    np.testing.assert_array_equal(arrays["encoders.1.0.weight"], named_arrays(network)["encoders.1.0.weight"])
     save_weights(again, network, about, half=True)
     assert again.stat().st_size < 0.7 * path.stat().st_size
     for a, b in zip(jax.tree.leaves(load_network(again)), jax.tree.leaves(network), strict=True):
@@ -363,13 +362,13 @@ def test_weights_come_back_with_what_is_told_of_them(tmp_path):
 
 
 def test_weights_that_say_something_else_than_they_are_are_not_written(tmp_path):
-    path = tmp_path / "a.npz"
+    path = tmp_path / "a.safetensors"
     for about, message in (
         ({}, "expected `flow`"),
         ({"flow": {**SETTINGS, "widths": [8, 9]}}, "build another network"),
         ({"flow": {**SETTINGS, "radii": [1]}}, "does not take the settings"),
         ({"flow": {**SETTINGS, "_target_": "os.system"}}, "expected a network of tagjax.flow"),
-        ({"flow": SETTINGS, "data": {1, 2}}, "expected numbers, texts"),
+        ({"flow": SETTINGS, "data": {1, 2}}, "expected numbers, strings"),
     ):
         with pytest.raises(ValueError, match=message):
             save_weights(path, small_network(), about)
@@ -379,81 +378,70 @@ def test_weights_that_say_something_else_than_they_are_are_not_written(tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def _rewritten(source: Path, target: Path, change: dict[str, bytes | None]) -> Path:
-    """A copy of a file of weights with some members replaced, added or (None) left out."""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
-        for name in dict.fromkeys([*old.namelist(), *change]):
-            content = change[name] if name in change else old.read(name)
-            if content is not None:
-                new.writestr(name, content)
+def _rewritten(
+    source: Path, target: Path, *, metadata: Any = None, arrays: dict[str, np.ndarray | None] | None = None
+) -> Path:
+    """A copy of a weights file with other metadata, or with some arrays replaced, added or (None) left out."""
+    with safetensors.safe_open(source, framework="numpy") as file:
+        header, names = file.metadata(), file.keys()
+        content = {name: file.get_tensor(name) for name in names}
+    content |= arrays or {}
+    header = header if metadata is None else {"tagjax": json.dumps(metadata)}
+    kept = {name: array for name, array in content.items() if array is not None}
+    target.write_bytes(safetensors.numpy.save(kept, header))
     return target
 
 
-def _npy(array: np.ndarray, **settings: Any) -> bytes:
-    held = io.BytesIO()
-    np.lib.format.write_array(held, array, **settings)
-    return held.getvalue()
-
-
-class _Touch:
-    """Unpickling this makes a file."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __reduce__(self):
-        return (Path.touch, (self.path,))
-
-
 def test_damaged_foreign_and_unfit_files_are_refused_in_words(tmp_path):
-    good, bad, trap = tmp_path / "good.npz", tmp_path / "bad.npz", tmp_path / "trap"
+    good, bad = tmp_path / "good.safetensors", tmp_path / "bad.safetensors"
     save_weights(good, small_network(), {"flow": SETTINGS})
-    content, name = good.read_bytes(), "upsampler.bias.npy"
-    told = weights_about(good)
+    content, name = good.read_bytes(), "upsampler.bias"
+    metadata = weights_metadata(good)
 
     def refused(message: str) -> None:
         for load in (load_network, lambda path: load_weights(small_network(), path), make_flow):
-            with pytest.raises(ValueError, match=message):
+            with pytest.raises(ValueError, match=message) as error:
                 load(str(bad))
+            assert "\n" not in str(error.value)
 
-    for cut in (0, 10, len(content) // 2, len(content) - 1):
+    for cut in (0, 4, 10, len(content) // 2, len(content) - 1):
         bad.write_bytes(content[:cut])
-        refused("no weights of a flow network")
-    at = content.index(b"decoders.1.layers.0.weight.npy") + 400
-    bad.write_bytes(content[:at] + bytes([content[at] ^ 255]) + content[at + 1 :])
-    refused("decoders.1.layers.0.weight cannot be read|holds")
-    np.savez(bad, weight=np.zeros(3))
-    refused("no weights of a flow network")
-    for about, message in (
-        ({**told, "format": "other"}, "an archive, but no weights"),
-        ({**told, "version": 2}, "version 2; this release reads 1"),
-        ([1], "an archive, but no weights"),
+        refused("no readable weights of a flow network")
+    bad.write_bytes((2**40).to_bytes(8, "little") + content[8:])
+    refused("a header of 1099511627776 bytes; expected at most 4000000")
+    bad.write_bytes(content[:-40] + bytes([content[-40] ^ 1]) + content[-39:])
+    refused("do not have the checksum of the header|not finite")
+    np.savez(tmp_path / "other.npz", weight=np.zeros(3))
+    bad.write_bytes((tmp_path / "other.npz").read_bytes())
+    refused("no readable weights of a flow network")
+    bad.write_bytes(safetensors.numpy.save({"weight": np.zeros(3)}))
+    refused("a safetensors file, but no weights")
+    for other, message in (
+        ({**metadata, "format": "other"}, "a safetensors file, but no weights"),
+        ({**metadata, "version": 2}, "version 2; this release reads version 1"),
+        ([1], "a safetensors file, but no weights"),
     ):
-        _rewritten(good, bad, {"about.json": json.dumps(about).encode()})
+        _rewritten(good, bad, metadata=other)
         refused(message)
-    objects = np.array([_Touch(trap)], dtype=object)
     for array, message in (
-        (_npy(np.zeros(35, np.float32)), r"upsampler.bias is float32 of shape \(35,\); this network has .*\(36,\)"),
-        (_npy(np.zeros(36, np.int64)), "upsampler.bias is int64"),
-        (_npy(objects, allow_pickle=True), "upsampler.bias is object"),
-        (_npy(np.full(36, np.inf, np.float32)), "upsampler.bias holds values that are not finite"),
-        (_npy(np.zeros(36, np.float32))[:-4], "upsampler.bias holds 140 of 144 bytes"),
-        (pickle.dumps(_Touch(trap)), "upsampler.bias cannot be read"),
+        (np.zeros(35, np.float32), r"upsampler.bias is float32 of shape \(35,\); this network has .*\(36,\)"),
+        (np.zeros(36, np.int64), "upsampler.bias is I64"),
+        (np.full(36, np.inf, np.float32), "upsampler.bias holds values that are not finite"),
+        (np.ones(36, np.float32), "do not have the checksum of the header"),
         (None, r"1 arrays are missing \(upsampler.bias\), 0 are unknown"),
     ):
-        _rewritten(good, bad, {name: array})
+        _rewritten(good, bad, arrays={name: array})
         refused(message)
-    _rewritten(good, bad, {"more.npy": _npy(np.zeros(1))})
+    _rewritten(good, bad, arrays={"more": np.zeros(1, np.float32)})
     refused(r"0 arrays are missing \(\), 1 are unknown \(more\)")
-    assert not trap.exists()
     with pytest.raises(ValueError, match="No weights at"):
-        load_network(tmp_path / "none.npz")
+        load_network(tmp_path / "none.safetensors")
 
 
 def test_settings_of_a_file_name_nothing_but_networks(tmp_path):
-    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    good, bad = tmp_path / "good.safetensors", tmp_path / "bad.safetensors"
     save_weights(good, small_network(), {"flow": SETTINGS})
-    told = weights_about(good)
+    told = weights_metadata(good)
     for target in (
         "os.system",
         "tagjax.flow.pyramid._Decoder",
@@ -465,26 +453,26 @@ def test_settings_of_a_file_name_nothing_but_networks(tmp_path):
         None,
     ):
         flow = {**SETTINGS, "_target_": target}
-        _rewritten(good, bad, {"about.json": json.dumps({**told, "flow": flow}).encode()})
+        _rewritten(good, bad, metadata={**told, "flow": flow})
         with pytest.raises(ValueError, match="expected a network of tagjax"):
             load_network(bad)
     # No memory is taken for what a file merely claims to hold.
     flow = {**SETTINGS, "widths": [8, 10**7]}
-    _rewritten(good, bad, {"about.json": json.dumps({**told, "flow": flow}).encode()})
+    _rewritten(good, bad, metadata={**told, "flow": flow})
     with pytest.raises(ValueError, match=r"this network has floats of shape \(2, 2, 8, 10000000\)|10000000"):
         load_network(bad)
 
 
 def test_packaged_weights_are_found_by_name_and_by_network(packaged):
     with pytest.raises(
-        ValueError, match=r"No weights are packaged for tagjax.flow.pyramid.PyramidFlow \(there are: none"
+        ValueError, match=r"No weights are packaged for tagjax.flow.pyramid.PyramidFlow \(packaged are: none"
     ):
         load_weights(small_network())
     with pytest.raises(
         ValueError, match=r"Unknown optical flow 'pyramid'; expected one of zero, dis.*weights \(none\)"
     ):
         make_flow("pyramid")
-    save_weights(packaged / "pyramid.npz", small_network(5), {"flow": SETTINGS})
+    save_weights(packaged / "pyramid.safetensors", small_network(5), {"flow": SETTINGS})
     _same(load_weights(small_network()), small_network(5))
     _same(load_weights(small_network(), "pyramid"), small_network(5))
     flow = make_flow("pyramid")
@@ -504,12 +492,12 @@ def test_packaged_weights_are_found_by_name_and_by_network(packaged):
 def test_of_packaged_weights_of_one_class_those_that_fit_are_taken(packaged):
     apart = {**SETTINGS, "separable": True, "matched": [4, 4]}
     split = build({**apart, "seed": 3})
-    save_weights(packaged / "a.npz", split, {"flow": apart})
-    save_weights(packaged / "b.npz", small_network(5), {"flow": SETTINGS})
+    save_weights(packaged / "a.safetensors", split, {"flow": apart})
+    save_weights(packaged / "b.safetensors", small_network(5), {"flow": SETTINGS})
     _same(load_weights(small_network()), small_network(5))
     _same(load_weights(build(apart)), split)
     _same(load_network("a"), split)
-    with pytest.raises(ValueError, match="weights of a flow network that do not fit this one"):
+    with pytest.raises(ValueError, match="weights of a flow network that do not fit this network"):
         load_weights(build({**SETTINGS, "widths": [8, 16]}))
 
 
@@ -526,7 +514,7 @@ def stored(tmp_path) -> Path:
 
 
 def test_kept_flow_is_that_of_the_weights(stored, tmp_path):
-    one, other = tmp_path / "one.npz", tmp_path / "other.npz"
+    one, other = tmp_path / "one.safetensors", tmp_path / "other.safetensors"
     save_weights(one, small_network(1, 30.0), {"flow": SETTINGS})
     save_weights(other, small_network(2, 30.0), {"flow": SETTINGS})
     recording = open_recording(stored)
@@ -540,14 +528,14 @@ def test_kept_flow_is_that_of_the_weights(stored, tmp_path):
     flow = NetworkFlow(load_network(one))
     pictures = np.asarray(recording.colour[0:2])
     there, back = flow(pictures[0], pictures[1]), flow(pictures[1], pictures[0])
-    np.testing.assert_allclose(first[0][0], settled(there, pictures[0], pictures[1]), atol=2e-3, rtol=2e-3)
-    np.testing.assert_allclose(first[1][0], settled(back, pictures[1], pictures[0]), atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(first[0][0], zero_stationary(there, pictures[0], pictures[1]), atol=2e-3, rtol=2e-3)
+    np.testing.assert_allclose(first[1][0], zero_stationary(back, pictures[1], pictures[0]), atol=2e-3, rtol=2e-3)
     assert np.any(first[0][0] != 0, axis=-1).mean() > 0.1
     # Another training in the same file gives another flow, not the kept one.
     save_weights(one, small_network(2, 30.0), {"flow": SETTINGS})
     np.testing.assert_array_equal(pair_flow(recording, 1, 6, str(one))[0], second[0])
     with pytest.raises(ValueError, match="No weights at"):
-        pair_flow(recording, 1, 6, str(tmp_path / "none.npz"))
+        pair_flow(recording, 1, 6, str(tmp_path / "none.safetensors"))
 
 
 def test_a_flow_at_rest_is_the_flow_where_rest_explains_less():
@@ -577,7 +565,7 @@ def test_a_flow_at_rest_is_the_flow_where_rest_explains_less():
 
 
 def test_clips_take_any_named_flow(stored, tmp_path):
-    path = tmp_path / "w.npz"
+    path = tmp_path / "w.safetensors"
     save_weights(path, small_network(1, 30.0), {"flow": SETTINGS})
     recording = open_recording(stored)
     assert not np.any(load_clip(recording, 0, 6, stride=2, flow="zero").frames.forward_px)
@@ -662,7 +650,7 @@ def test_any_flow_by_name_comes_with_what_is_hidden(name: str) -> None:
     found = estimate(flow, first, second)
     np.testing.assert_allclose(found.forward_px, flow(first, second), atol=1e-4)
     np.testing.assert_allclose(found.backward_px, flow(second, first), atol=1e-4)
-    whole = agreement(found.forward_px, found.backward_px)
+    whole = consistency(found.forward_px, found.backward_px)
     np.testing.assert_allclose(found.forward_confidence, whole, atol=1e-5)
     np.testing.assert_array_equal(found.forward_occluded, np.asarray(whole) <= 0.5)
 
@@ -671,15 +659,15 @@ def test_any_flow_by_name_comes_with_what_is_hidden(name: str) -> None:
 def test_networks_without_weights_and_variants_of_a_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"'raft_small' comes without weights.*flow=raft_small"):
         make_flow("raft_small")
-    mine = tmp_path / "mine.npz"
-    mine.write_bytes((tagjax.flow.weights.PACKAGED / "pyramid.npz").read_bytes())
+    mine = tmp_path / "mine.safetensors"
+    mine.write_bytes((tagjax.flow.weights.PACKAGED / "pyramid.safetensors").read_bytes())
     assert flow_key(f"pyramid_fine:{mine}") == flow_key("pyramid_fine") != flow_key(f"pyramid_mid:{mine}+rest")
     first, second = _pictures(2, 70, 80)
     np.testing.assert_array_equal(
         make_flow(f"pyramid_mid:{mine}")(first, second), make_flow("pyramid_mid")(first, second)
     )
-    with pytest.raises(ValueError, match=r"No weights at 'none\.npz'"):
-        make_flow("pyramid_mid:none.npz")
+    with pytest.raises(ValueError, match=r"No weights at 'none\.safetensors'"):
+        make_flow("pyramid_mid:none.safetensors")
 
 
 def test_the_package_gives_flows_by_name() -> None:

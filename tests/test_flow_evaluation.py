@@ -19,7 +19,7 @@ from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings, evaluate_flows, flow_tables
 from tagjax.evaluation.flow_cases import drawn_material, folder_material, recording_material, sequence_material
 from tagjax.flow.flo_files import read_flo, write_flo
-from tagjax.flow.named import make_flow
+from tagjax.flow.registry import make_flow
 from tagjax.metrics.flow import FlowScores, endpoint_error, warped_error
 from tagjax.recording import RecordingError, Truth
 from tagjax.recording.store import save_recording
@@ -346,7 +346,7 @@ def test_unknown_flows_are_refused_before_anything_is_computed(tmp_path):
     with pytest.raises(ValueError, match="Unknown optical flow 'dos'"):
         evaluate_flows(FlowEvaluationSettings(flows=("dos",), progress=False), tmp_path)
     with pytest.raises(ValueError, match="No weights at"):
-        evaluate_flows(FlowEvaluationSettings(flows=("none.npz",), progress=False), tmp_path)
+        evaluate_flows(FlowEvaluationSettings(flows=("none.safetensors",), progress=False), tmp_path)
 
 
 def test_the_configuration_fits_its_schema_and_names_every_key():

@@ -12,7 +12,26 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from tagjax.flow._layers import enlarge_flow
-from tagjax.flow.losses import FlowLossSettings, charbonnier, data_distance, data_term, imitation_term, inconsistency, inside, level_terms, margin_of, occluded, sequence_terms, shown, smoothness, ssim_distance, teaching_term, weighted
+from tagjax.flow.loss_terms import (
+    charbonnier,
+    consistency_error_px2,
+    crop_margin_px,
+    inside,
+    occluded,
+    self_supervision_term,
+    smoothness,
+    ssim_distance,
+)
+from tagjax.flow.losses import (
+    FlowLossSettings,
+    data_distance,
+    data_term,
+    distillation_term,
+    level_terms,
+    sequence_terms,
+    total_loss,
+    visible_mask,
+)
 from tagjax.image.census import GREY, census_distance, census_offsets, ternary, to_grey
 
 KINDS = ("census", "photometric", "ssim")
@@ -237,10 +256,10 @@ def test_a_margin_of_nothing_is_no_margin():
 
 
 def test_margins_that_are_not_alike_are_refused():
-    assert margin_of((20, 30), (26, 36)) == 3
+    assert crop_margin_px((20, 30), (26, 36)) == 3
     for whole in ((26, 34), (25, 35), (18, 28)):
-        with pytest.raises(ValueError, match="equally far"):
-            margin_of((20, 30), whole)
+        with pytest.raises(ValueError, match="expected the same margin"):
+            crop_margin_px((20, 30), whole)
 
 
 # Occlusion
@@ -261,7 +280,7 @@ def test_occluded_is_what_the_square_covers():
     uncovered = np.zeros((24, 40), bool)
     uncovered[7:17, 8:14] = True
     np.testing.assert_array_equal(occluded(jnp.asarray(backward), jnp.asarray(forward)), uncovered)
-    gap, length = inconsistency(jnp.asarray(forward), jnp.asarray(backward))
+    gap, length = consistency_error_px2(jnp.asarray(forward), jnp.asarray(backward))
     np.testing.assert_allclose(gap, 36.0 * covered, atol=1e-5)
     np.testing.assert_allclose(length, 36.0 * covered + 72.0 * (forward[..., 0] > 0), atol=1e-5)
 
@@ -270,15 +289,15 @@ def test_hiding_begins_when_it_is_told_to_and_has_no_gradient():
     forward, backward, covered = (jnp.asarray(each) for each in _curtain())
     settings = FlowLossSettings()
     on, off = jnp.ones(()), jnp.zeros(())
-    np.testing.assert_array_equal(shown(forward, backward, off, settings), np.ones((24, 40)))
-    np.testing.assert_array_equal(shown(forward, backward, on, settings), ~np.asarray(covered))
+    np.testing.assert_array_equal(visible_mask(forward, backward, off, settings), np.ones((24, 40)))
+    np.testing.assert_array_equal(visible_mask(forward, backward, on, settings), ~np.asarray(covered))
     never = dataclasses.replace(settings, occlusion=False)
-    np.testing.assert_array_equal(shown(forward, backward, on, never), np.ones((24, 40)))
+    np.testing.assert_array_equal(visible_mask(forward, backward, on, never), np.ones((24, 40)))
     # What leaves for the margin has no way back to check.
     leaving = _flow(24, 40, 5.0)
-    assert float(jnp.sum(1 - shown(leaving, _flow(24, 40), on, settings, 5))) == 24 * 35
-    assert float(jnp.sum(shown(leaving, -leaving, on, settings))) == 24 * 35
-    for gradient in jax.grad(lambda f, b: jnp.sum(shown(f, b, on, settings)), argnums=(0, 1))(forward, backward):
+    assert float(jnp.sum(1 - visible_mask(leaving, _flow(24, 40), on, settings, 5))) == 24 * 35
+    assert float(jnp.sum(visible_mask(leaving, -leaving, on, settings))) == 24 * 35
+    for gradient in jax.grad(lambda f, b: jnp.sum(visible_mask(f, b, on, settings)), argnums=(0, 1))(forward, backward):
         assert float(jnp.abs(gradient).max()) == 0
 
 
@@ -323,10 +342,10 @@ def test_teaching_is_the_mean_gap_where_only_the_teacher_is_sure():
     student_hidden = jnp.zeros((6, 8), bool).at[1:4, 2:6].set(True)
     # 12 pixels that the student cannot see, less the one that the teacher cannot either; a gap of 1.5 and 2.
     expected = 11 * (1.5 + 2.0) / 48
-    found = teaching_term(student, teacher, student_hidden, teacher_hidden, 2)
+    found = self_supervision_term(student, teacher, student_hidden, teacher_hidden, 2)
     assert float(found) == pytest.approx(expected, rel=1e-5)
     nobody = jnp.zeros((6, 8), bool)
-    assert float(teaching_term(student, teacher, nobody, teacher_hidden, 2)) == 0
+    assert float(self_supervision_term(student, teacher, nobody, teacher_hidden, 2)) == 0
 
 
 def test_teaching_gradient_reaches_the_student_only(gradients_agree):
@@ -335,7 +354,7 @@ def test_teaching_gradient_reaches_the_student_only(gradients_agree):
     teacher, student = _uneven(7, 8), _uneven(3, 4, seed=3)
 
     def term(student, teacher):
-        return teaching_term(student, teacher, jnp.asarray(student_hidden), jnp.asarray(teacher_hidden), 2)
+        return self_supervision_term(student, teacher, jnp.asarray(student_hidden), jnp.asarray(teacher_hidden), 2)
 
     gradients_agree(lambda s: term(s, jnp.asarray(teacher, s.dtype)), (student,))
     to_teacher = jax.grad(term, argnums=1)(jnp.asarray(student), jnp.asarray(teacher))
@@ -348,7 +367,7 @@ def test_teaching_gradient_reaches_the_student_only(gradients_agree):
 
 
 def _imitated(levels, teacher, **changes):
-    return imitation_term(levels, teacher, dataclasses.replace(SETTINGS, **changes))
+    return distillation_term(levels, teacher, dataclasses.replace(SETTINGS, **changes))
 
 
 def test_imitation_is_the_weighted_robust_distance_from_the_teachers_flow():
@@ -410,7 +429,7 @@ def test_the_terms_are_summed_over_levels_by_their_weights():
     for level, (weight, flow, back, one, other) in enumerate(
         ((1.0, forward[2], backward[2], first, second), (0.5, forward[1], backward[1], *map(jnp.asarray, small)))
     ):
-        visible = shown(flow, back, jnp.ones(()), SETTINGS)
+        visible = visible_mask(flow, back, jnp.ones(()), SETTINGS)
         warped = np.stack(
             [
                 map_coordinates(
@@ -429,10 +448,10 @@ def test_the_terms_are_summed_over_levels_by_their_weights():
         expected += weight * float((distance * visible).sum() / visible.sum())
     assert float(found["data"]) == pytest.approx(expected, rel=1e-4)
     assert float(found["smooth_first"]) == pytest.approx(float(smoothness(forward[1], jnp.asarray(small[0]), 50.0, 1)))
-    assert float(found["hidden_share"]) == pytest.approx(
-        1 - float(shown(forward[2], backward[2], jnp.ones(()), SETTINGS).mean())
+    assert float(found["occluded_fraction"]) == pytest.approx(
+        1 - float(visible_mask(forward[2], backward[2], jnp.ones(()), SETTINGS).mean())
     )
-    total = weighted({**found, "teaching": jnp.asarray(2.0)}, SETTINGS)
+    total = total_loss({**found, "self_supervision": jnp.asarray(2.0)}, SETTINGS)
     parts = (found["data"], found["smooth_first"], 0.3 * found["smooth_second"], 0.2 * 2.0)
     assert float(total) == pytest.approx(sum(map(float, parts)), rel=1e-6)
 
@@ -458,7 +477,7 @@ def test_the_whole_loss_has_the_gradient_of_its_parts(gradients_agree):
     def loss(flow):
         pictures = (jnp.asarray(each, flow.dtype) for each in (first, second))
         back = tuple(jnp.asarray(each, flow.dtype) for each in backward)
-        return weighted(_terms((flow,), back, *pictures), SETTINGS)
+        return total_loss(_terms((flow,), back, *pictures), SETTINGS)
 
     gradients_agree(jax.jit(loss), (_uneven(8, 8, seed=8),), atol=1e-5)
 
@@ -467,7 +486,7 @@ def test_a_margin_must_fit_every_level():
     forward, first = _pyramid(), _colour()
     wide = _colour(38, 38, seed=3)
     _terms(forward[2:], forward[2:], first, wide)
-    with pytest.raises(ValueError, match=r"margin of 3 .* multiple of 2"):
+    with pytest.raises(ValueError, match=r"margin .* is 3 pixels; expected a multiple of 2"):
         _terms(forward, forward, first, wide)
 
 

@@ -18,13 +18,15 @@ import pytest
 from jaxtyping import Array, Float
 
 from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.flow.augmentation import AugmentationSettings, augment
 from tagjax.flow.estimates import NetworkFlow
+from tagjax.flow.image_pairs import PairSource, StackedPairs, pair_dataset
+from tagjax.flow.image_sequences import ImageFolder, open_sequence
 from tagjax.flow.losses import FlowLossSettings
-from tagjax.flow.named import make_flow
 from tagjax.flow.network import AbstractFlowNetwork
-from tagjax.flow.picture_pairs import ImageFolder, PairSource, StackedPairs, VariationSettings, open_sequence, pair_dataset, vary
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
+from tagjax.flow.registry import make_flow
 from tagjax.recording import RecordingError
 from tagjax.sim.flow_pairs import FlowPair, FlowPairSettings
 from tagjax.training import flow_sources
@@ -41,8 +43,8 @@ SMALL = {
     "radii": [1, 1],
     "decoder_widths": [[8], [8]],
 }
-PLAIN = VariationSettings(
-    height=32, width=48, scale=(1.0, 1.0), turn_deg=0.0, gain=0.0, gamma=0.0, tint=0.0, unlike=0.0, noise=0.0,
+PLAIN = AugmentationSettings(
+    height=32, width=48, scale=(1.0, 1.0), rotation_deg=0.0, gain=0.0, gamma=0.0, tint=0.0, gain_difference=0.0, noise=0.0,
     grey_probability=0.0,
 )  # fmt: skip
 
@@ -104,7 +106,7 @@ def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
     elif broken == "cut":
         for name in names:
             (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:60])
-        told = r"none of 2 pictures can be read. First: .*a\.png: the picture is cut short"
+        told = r"none of 2 images can be read. First: .*a\.png: the image is truncated"
     elif broken == "nothing":
         path, told = str(tmp_path / "nowhere"), "found nothing"
     else:
@@ -122,9 +124,16 @@ def test_bad_pictures_of_a_folder_are_named_when_it_is_opened(tmp_path: Path) ->
     for name, share in (("9.png", 0.9), ("11.jpg", 0.9), ("19.png", 0.0)):
         whole = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(RecordingError, match="4 of 20 pictures cannot be used; expected whole ones of 50 x 40") as told:
+    with pytest.raises(
+        RecordingError, match="4 of 20 images cannot be used; expected complete images of 50 x 40"
+    ) as told:
         open_sequence(str(tmp_path), tmp_path / "cache")
-    for words in ("0.png: 50 x 30 pix", "9.png: the picture is cut", "11.jpg: the picture is cut", "19.png: no read"):
+    for words in (
+        "0.png: 50 x 30 pix",
+        "9.png: the image is truncated",
+        "11.jpg: the image is truncated",
+        "19.png: no read",
+    ):
         assert words in str(told.value)
     for number in range(20):
         cv2.imwrite(str(tmp_path / f"{number}.bmp"), pictures[0][:30])
@@ -137,7 +146,7 @@ def test_a_picture_that_changes_after_opening_is_named(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / f"{number}.png"), picture)
     folder = ImageFolder(tmp_path)
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((30, 50, 3), np.uint8))
-    with pytest.raises(RecordingError, match=r"1\.png has 50 x 30 pixels by now; all had 50 x 40"):
+    with pytest.raises(RecordingError, match=r"1\.png has 50 x 30 pixels now; all images had 50 x 40"):
         folder[1]
 
 
@@ -193,7 +202,7 @@ def test_video_is_read_to_its_end_whatever_it_says_of_its_length(
 
 def test_video_of_one_frame_is_refused_and_not_kept(tmp_path: Path) -> None:
     write_video(tmp_path / "film.avi", smooth_pictures(1, 32, 48))
-    with pytest.raises(RecordingError, match=r"film\.avi holds 1 picture"):
+    with pytest.raises(RecordingError, match=r"film\.avi holds 1 image"):
         open_sequence(str(tmp_path / "film.avi"), tmp_path / "cache")
     assert not (tmp_path / "cache").exists() or not list((tmp_path / "cache").iterdir())
 
@@ -220,8 +229,8 @@ def test_pairs_are_the_gaps_apart() -> None:
 def test_without_variation_the_cut_is_a_piece_of_the_pictures() -> None:
     pair = smooth_pictures(2, 64, 80)
     for seed in range(6):
-        cut = vary(pair, np.random.default_rng(seed), PLAIN)
-        np.testing.assert_array_equal(cut["clean"], cut["seen"])
+        cut = augment(pair, np.random.default_rng(seed), PLAIN)
+        np.testing.assert_array_equal(cut["clean"], cut["augmented"])
         best = min(
             np.mean(np.abs(cv2.matchTemplate(candidate[which], cut["clean"][0], cv2.TM_SQDIFF_NORMED).min()))
             for which in (0, 1)
@@ -234,17 +243,17 @@ def test_without_variation_the_cut_is_a_piece_of_the_pictures() -> None:
 def test_both_pictures_are_cut_alike_and_variation_spares_the_clean_ones() -> None:
     picture = smooth_pictures(1, 100, 120)[0]
     pair = np.stack([picture, picture])
-    settings = VariationSettings(height=64, width=64)
+    settings = AugmentationSettings(height=64, width=64)
     for seed in range(4):
-        found = vary(pair, np.random.default_rng(seed), settings)
+        found = augment(pair, np.random.default_rng(seed), settings)
         np.testing.assert_array_equal(found["clean"][0], found["clean"][1])
-        assert np.any(found["seen"] != found["clean"])
-        again = vary(pair, np.random.default_rng(seed), settings)
-        np.testing.assert_array_equal(found["seen"], again["seen"])
+        assert np.any(found["augmented"] != found["clean"])
+        again = augment(pair, np.random.default_rng(seed), settings)
+        np.testing.assert_array_equal(found["augmented"], again["augmented"])
 
 
 def test_small_pictures_are_enlarged_to_the_cut() -> None:
-    found = vary(smooth_pictures(2, 20, 20), np.random.default_rng(0), PLAIN)
+    found = augment(smooth_pictures(2, 20, 20), np.random.default_rng(0), PLAIN)
     assert found["clean"].shape == (2, 32, 48, 3)
 
 
@@ -252,10 +261,10 @@ def test_the_clean_pictures_reach_further_by_the_margin() -> None:
     settings = dataclasses.replace(PLAIN, margin_px=8)
     pair = smooth_pictures(2, 64, 80)
     for seed in range(4):
-        found = vary(pair, np.random.default_rng(seed), settings)
+        found = augment(pair, np.random.default_rng(seed), settings)
         assert found["clean"].shape == (2, 48, 64, 3)
-        np.testing.assert_array_equal(found["clean"][:, 8:-8, 8:-8], found["seen"])
-    wide = vary(smooth_pictures(2, 20, 20), np.random.default_rng(0), settings)
+        np.testing.assert_array_equal(found["clean"][:, 8:-8, 8:-8], found["augmented"])
+    wide = augment(smooth_pictures(2, 20, 20), np.random.default_rng(0), settings)
     assert wide["clean"].shape == (2, 48, 64, 3)
 
 
@@ -272,14 +281,14 @@ def test_flow_is_cut_as_the_pictures_are() -> None:
     x, y = np.meshgrid(np.linspace(-1, 1, 140), np.linspace(-1, 1, 120))
     flow = np.stack([5 + 2 * y, -3 + 2 * x], axis=-1).astype(np.float32)
     pair = np.stack([_moved(flow, second), second])
-    settings = dataclasses.replace(PLAIN, height=64, width=64, margin_px=8, scale=(0.8, 1.2), turn_deg=30.0)
+    settings = dataclasses.replace(PLAIN, height=64, width=64, margin_px=8, scale=(0.8, 1.2), rotation_deg=30.0)
     inner = slice(12, -12), slice(12, -12)
     for seed in range(6):
         varied = dataclasses.replace(settings, transpose_probability=float(seed % 2))
-        found = vary(pair, np.random.default_rng(seed), varied, flow)
+        found = augment(pair, np.random.default_rng(seed), varied, flow)
         assert found["flow_px"].shape == (64, 64, 2)
         assert found["clean"].shape == (2, 80, 80, 3)
-        one, other = found["seen"].astype(np.float32)
+        one, other = found["augmented"].astype(np.float32)
         known = np.all(np.isfinite(found["flow_px"]), axis=-1)[inner]
         back = np.abs(_moved(np.nan_to_num(found["flow_px"]), other) - one)[inner][known]
         still = np.abs(other - one)[inner][known]
@@ -289,9 +298,9 @@ def test_flow_is_cut_as_the_pictures_are() -> None:
 
 def test_beyond_the_picture_there_is_no_flow() -> None:
     flow = np.ones((64, 64, 2), np.float32)
-    settings = dataclasses.replace(PLAIN, height=64, width=64, turn_deg=45.0)
+    settings = dataclasses.replace(PLAIN, height=64, width=64, rotation_deg=45.0)
     shares = [
-        np.isnan(vary(smooth_pictures(2, 64, 64), np.random.default_rng(seed), settings, flow)["flow_px"]).mean()
+        np.isnan(augment(smooth_pictures(2, 64, 64), np.random.default_rng(seed), settings, flow)["flow_px"]).mean()
         for seed in range(4)
     ]
     assert max(shares) > 0.05
@@ -299,18 +308,22 @@ def test_beyond_the_picture_there_is_no_flow() -> None:
 
 def test_negatives_and_exchanged_colours_are_those() -> None:
     pair = smooth_pictures(2, 64, 80)
-    plain = vary(pair, np.random.default_rng(0), PLAIN)
-    negative = vary(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_probability=1.0))
+    plain = augment(pair, np.random.default_rng(0), PLAIN)
+    negative = augment(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_probability=1.0))
     np.testing.assert_array_equal(negative["clean"], plain["clean"])
-    np.testing.assert_allclose(negative["seen"].astype(float), 255 - plain["seen"].astype(float), atol=1)
+    np.testing.assert_allclose(negative["augmented"].astype(float), 255 - plain["augmented"].astype(float), atol=1)
     orders = set()
     for seed in range(8):
-        found = vary(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_probability=1.0))
+        found = augment(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_probability=1.0))
         order = [
-            int(np.argmin([np.abs(found["seen"][..., n].astype(int) - found["clean"][..., k]).sum() for k in range(3)]))
+            int(
+                np.argmin(
+                    [np.abs(found["augmented"][..., n].astype(int) - found["clean"][..., k]).sum() for k in range(3)]
+                )
+            )
             for n in range(3)
         ]
-        np.testing.assert_array_equal(found["seen"], found["clean"][..., order])
+        np.testing.assert_array_equal(found["augmented"], found["clean"][..., order])
         orders.add(tuple(order))
     assert len(orders) > 2
 
@@ -336,7 +349,7 @@ def test_impossible_cuts_are_refused() -> None:
     pictures = np.zeros((3, 40, 48, 3), np.uint8)
     with pytest.raises(RecordingError, match="48 x 40 pixels; cuts for a student take 64 x 32"):
         cut_pairs(pictures, 2, (32, 64), (1,), seed=0)
-    with pytest.raises(RecordingError, match="No two of 3 pictures are 4 frames apart"):
+    with pytest.raises(RecordingError, match="No two of 3 images are 4 frames apart"):
         cut_pairs(pictures, 2, (32, 32), (4,), seed=0)
 
 
@@ -410,7 +423,7 @@ def test_a_student_is_given_its_teachers_flow_of_drawn_pairs_and_of_cuts(tmp_pat
         sample = next(samples)
         assert sample["flow_px"].shape == (32, 32, 2)
         assert sample["flow_px"].dtype == np.float32
-        assert sample["seen"].shape == (2, 32, 32, 3)
+        assert sample["augmented"].shape == (2, 32, 32, 3)
     samples.close()
     kept = {path.name.split("-")[0] for path in Path(settings.drawn.folder).iterdir()}
     assert kept == {"flow"}
@@ -449,7 +462,7 @@ def test_a_student_learns_what_the_teacher_says() -> None:
 )
 def test_impossible_variation_is_refused(change: dict) -> None:
     with pytest.raises(ValueError, match=r"expected|too small"):
-        VariationSettings(**change)
+        AugmentationSettings(**change)
 
 
 def test_stream_of_pairs_resumes_exactly() -> None:
@@ -457,17 +470,17 @@ def test_stream_of_pairs_resumes_exactly() -> None:
         PairSource(smooth_pictures(5, 64, 80), (1,)),
         StackedPairs(smooth_pictures(6, 64, 80).reshape(3, 2, 64, 80, 3)),
     ]
-    settings = VariationSettings(height=32, width=32)
+    settings = AugmentationSettings(height=32, width=32)
     stream = iter(pair_dataset(sources, (0.5, 0.5), settings, seed=3))
     for _ in range(5):
         next(stream)
     place = stream.get_state()
-    ahead = [next(stream)["seen"] for _ in range(4)]
+    ahead = [next(stream)["augmented"] for _ in range(4)]
     other = iter(pair_dataset(sources, (0.5, 0.5), settings, seed=3))
     other.set_state(place)
     for expected in ahead:
-        np.testing.assert_array_equal(next(other)["seen"], expected)
-    with pytest.raises(ValueError, match="positive share"):
+        np.testing.assert_array_equal(next(other)["augmented"], expected)
+    with pytest.raises(ValueError, match="positive weight"):
         pair_dataset(sources, (1.0,), settings, seed=0)
 
 
@@ -520,7 +533,7 @@ def test_drawn_pairs_go_on_where_drawing_was_interrupted(tmp_path: Path, monkeyp
 
 def batch(count: int = 2, seed: int = 0) -> list[dict[str, np.ndarray]]:
     pictures = smooth_pictures(2 * count, 32, 32, seed).reshape(count, 2, 32, 32, 3)
-    return [{"clean": pair, "seen": pair} for pair in pictures]
+    return [{"clean": pair, "augmented": pair} for pair in pictures]
 
 
 @pytest.mark.ci
@@ -554,7 +567,10 @@ def test_a_recurrent_network_learns_by_its_sequence_beyond_the_crop() -> None:
     optimizer = optax.adam(1e-3)
     network = eqx.filter_jit(lambda: RAFTSmall(updates=2, levels=1, radius=1))()
     samples = [
-        {"clean": np.pad(sample["clean"], ((0, 0), (8, 8), (8, 8), (0, 0)), mode="reflect"), "seen": sample["seen"]}
+        {
+            "clean": np.pad(sample["clean"], ((0, 0), (8, 8), (8, 8), (0, 0)), mode="reflect"),
+            "augmented": sample["augmented"],
+        }
         for sample in batch()
     ]
     state = FlowTrainState.create(network, optimizer, seed=0)
@@ -605,7 +621,7 @@ def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     pictures = jnp.asarray(np.stack([sample["clean"][:, :31] for sample in batch()]), jnp.float32) / 255
     shares = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=False)[1]["hidden_share"])
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=False)[1]["occluded_fraction"])
         for step in (4, 5)
     ]
     assert shares[0] == pytest.approx(1 / 32)  # what leaves the picture
@@ -622,7 +638,7 @@ def test_teacher_is_heard_late_and_then_ramped() -> None:
     pictures = jnp.asarray(dark * np.asarray([1.0, 0.5], np.float32).reshape(1, 2, 1, 1, 1))
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     teaching = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=True)[1]["teaching"])
+        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=True)[1]["self_supervision"])
         for step in (10, 15, 20, 40)
     ]
     # Backward, the student is two pixels off in one of two axes where the teacher is sure; forward it is right.
@@ -662,7 +678,7 @@ def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> No
     assert told["warped_levels"]["dis"] < 0.5 * told["warped_levels"]["zero"]
     assert set(told["epe_px"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
     np.testing.assert_allclose(score, told["epe_px"]["learned"]["all"])
-    assert (tmp_path / "run" / "weights.npz").is_file()
+    assert (tmp_path / "run" / "weights.safetensors").is_file()
 
 
 @pytest.mark.slow

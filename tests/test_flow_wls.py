@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tagjax.flow import estimate, flow_along, make_flow
-from tagjax.flow.estimates import agreement
-from tagjax.flow.named import flow_key, taken_apart
+from tagjax.flow.estimates import consistency
+from tagjax.flow.registry import flow_key, split_suffixes
 from tagjax.flow.wls import weighted_least_squares
 from tagjax.sim.flow_pairs import FlowPairSettings, flow_pair
 
@@ -29,7 +29,7 @@ def _square_before_a_wall() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 def test_what_is_hidden_takes_the_flow_of_what_it_belongs_to() -> None:
     picture, truth, back, hidden = _square_before_a_wall()
     guess = np.where(hidden[..., None], np.float32([9.0, -4.0]), truth)
-    confidence = agreement(jnp.asarray(guess), jnp.asarray(back))
+    confidence = consistency(jnp.asarray(guess), jnp.asarray(back))
     assert float(confidence[hidden].max()) < 0.1
     found = np.asarray(weighted_least_squares(jnp.asarray(guess), confidence, jnp.asarray(picture)))
     assert np.linalg.norm(found - truth, axis=-1)[hidden].max() < 0.1
@@ -82,8 +82,8 @@ def test_a_named_flow_is_smoothed_both_ways_alone_along_a_video_and_with_what_is
 
 def test_names_are_taken_apart_and_applied_in_their_order(pair) -> None:
     (first, second), _, _ = pair
-    assert taken_apart("dis") == ("dis", "")
-    assert taken_apart("pyramid_fine:w.npz+wls+rest") == ("pyramid_fine:w.npz", "+wls+rest")
+    assert split_suffixes("dis") == ("dis", "")
+    assert split_suffixes("pyramid_fine:w.safetensors+wls+rest") == ("pyramid_fine:w.safetensors", "+wls+rest")
     assert len({flow_key(name) for name in ("dis", "dis+wls", "dis+rest", "dis+wls+rest", "dis+rest+wls")}) == 5
     rested = make_flow("dis+wls+rest")(first, second)
     smoothed = make_flow("dis+wls")(first, second)

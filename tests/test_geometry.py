@@ -6,8 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tagjax.core.geometry import backproject, crop_resize, depth_to_range, pixel_rays, project, range_to_depth, register_depth, undistort, undistorted_positions
-from tagjax.flow.opencv import make_flow
+from tagjax.core.geometry import (
+    backproject,
+    pixel_rays,
+    project,
+    range_to_depth,
+    register_depth,
+    undistort,
+    undistorted_positions,
+)
+from tagjax.flow.registry import make_flow
 from tagjax.recording import Intrinsics
 
 CAMERA = Intrinsics(53.0, 54.0, 31.2, 24.1, 64, 48)
@@ -23,10 +31,9 @@ def test_projecting_what_was_backprojected_is_the_identity():
     assert np.isnan(project(np.array([[0.0, 0.0, -1.0]]), CAMERA)).all()
 
 
-def test_range_and_depth_differ_off_the_axis_and_invert_each_other():
+def test_range_becomes_depth_off_the_optical_axis():
     depth = np.full((48, 64), 2.0, np.float32)
-    distance = depth_to_range(depth, CAMERA)
-    np.testing.assert_allclose(distance, np.linalg.norm(backproject(depth, CAMERA), axis=-1), rtol=1e-6)
+    distance = np.linalg.norm(backproject(depth, CAMERA), axis=-1)
     assert distance[0, 0] > 2.2
     np.testing.assert_allclose(range_to_depth(distance, CAMERA), depth, rtol=1e-6)
 
@@ -71,32 +78,10 @@ def test_undistortion_agrees_with_opencv():
     assert straight.distortion == ()
 
 
-def test_crop_resize_keeps_points_where_they_are():
-    camera = Intrinsics(534.0, 530.0, 320.0, 240.0, 640, 480)
-    x, y = np.meshgrid(np.arange(640), np.arange(480))
-    colour = np.stack([x // 4, y // 4, 0 * x], axis=-1).astype(np.uint8)
-    depth = np.full((480, 640), 2.0, np.float32)
-    picture, thin, scaled = crop_resize(colour, depth, camera)
-    assert picture.shape == (424, 512, 3)
-    assert thin.shape == (424, 512)
-    point = np.array([[0.3, -0.2, 2.0]])
-    before, after = project(point, camera)[0], project(point, scaled)[0]
-    column, row = np.rint(after).astype(int)
-    np.testing.assert_allclose(picture[row, column, :2].astype(float), before / 4, atol=1.0)
-
-
 def test_interpolated_pictures_are_rounded_not_cut():
     camera = Intrinsics(50.0, 50.0, 31.5, 23.5, 64, 48)
-    # A ramp of 0.7 levels a pixel over a resize by 2 / 3: positions fall between pixels, in closed form.
-    ramp = np.rint(100 + 0.7 * np.arange(64))
-    colour = np.broadcast_to(ramp[None, :, None], (48, 64, 3)).astype(np.uint8)
     depth = np.full((48, 64), 2.0, np.float32)
-    picture, _, _ = crop_resize(colour, depth, camera, (72, 96))
-    x = np.clip((np.arange(96) + 0.5) * 2 / 3 - 0.5, 0, 63)
-    exact = np.interp(x, np.arange(64), ramp)
-    np.testing.assert_array_equal(picture[10, :, 1], np.rint(exact))
     white = np.full((48, 64, 3), 255, np.uint8)
-    assert crop_resize(white, depth, camera, (72, 96))[0].min() == 255
     assert undistort(white, depth, camera)[0].min() == 255
 
     noise = RNG.integers(0, 256, (48, 64, 3)).astype(np.uint8)

@@ -17,7 +17,38 @@ from omegaconf import OmegaConf
 from scipy.stats import binomtest, multivariate_normal
 
 from tagjax.baselines import host_trace
-from tagjax.baselines.goller import AntennaModel, BlobSettings, BlobTracker, GollerSettings, GollerTracer, Site, antenna_weights, assignment_row, associate, best_threshold, calibrate, carried, covariance_m2, decide, exit_score, find_site, fit_antennas, fit_association, forward_filter, load_calibration, locate, make_association, make_grid, make_location, mixture_likelihood, observe, operating_point, roc_curve, rssi_score, save_calibration
+from tagjax.baselines.goller import (
+    AntennaModel,
+    BlobSettings,
+    BlobTracker,
+    GollerSettings,
+    GollerTracer,
+    Site,
+    antenna_weights,
+    assignment_row,
+    associate,
+    best_threshold,
+    calibrate,
+    carried,
+    covariance_m2,
+    decide,
+    exit_score,
+    find_site,
+    fit_antennas,
+    fit_association,
+    forward_filter,
+    load_calibration,
+    locate,
+    make_association,
+    make_grid,
+    make_location,
+    mixture_likelihood,
+    observe,
+    operating_point,
+    roc_curve,
+    rssi_score,
+    save_calibration,
+)
 from tagjax.baselines.goller._antennas import POWER_SCALE_DB, response_db
 from tagjax.baselines.goller._blobs import BlobTracks, in_slots
 from tagjax.baselines.goller._fit import true_states
@@ -25,7 +56,17 @@ from tagjax.baselines.goller._reads import RssiFrames, grid_statistic, rssi_fram
 from tagjax.baselines.goller._site import level_site
 from tagjax.baselines.goller._system import Calibration, empty_picture
 from tagjax.core.settings import from_mapping
-from tagjax.evaluation.goller import GollerConfig, follow, ladder, mean_curve, outcomes, rates, run_goller, scenario_paths, thresholds
+from tagjax.evaluation.goller import (
+    GollerConfig,
+    follow,
+    ladder,
+    mean_curve,
+    outcomes,
+    rates,
+    run_goller,
+    scenario_paths,
+    thresholds,
+)
 from tagjax.evaluation.goller._run import _handover_paths
 from tagjax.evaluation.goller._tables import interval
 from tagjax.recording import Intrinsics, Recording, RecordingError, TagReads, Truth

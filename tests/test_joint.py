@@ -17,7 +17,7 @@ from test_flow_training import small_network
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.pyramid import PyramidFlow
-from tagjax.flow.stillness import has_moved, settled
+from tagjax.flow.stationary import is_moving, zero_stationary
 from tagjax.flow.weights import load_network, save_weights
 from tagjax.recording import Recording
 from tagjax.recording.store import save_recording
@@ -68,8 +68,8 @@ def test_what_has_moved_is_what_the_cache_keeps():
     there = _panned(2).colour[1]
     flow = rng.normal((-PAN_PX, 0), 0.4, (*here.shape[:2], 2)).astype(np.float32)
     flow[: here.shape[0] // 2] += 3
-    kept = np.any(settled(flow, here, there) != 0, axis=-1)
-    found = eqx.filter_jit(has_moved)(flow, *(np.float32(each) / 255 for each in (here, there)))
+    kept = np.any(zero_stationary(flow, here, there) != 0, axis=-1)
+    found = eqx.filter_jit(is_moving)(flow, *(np.float32(each) / 255 for each in (here, there)))
     assert 0.2 < kept.mean() < 0.8
     assert np.mean(kept == np.asarray(found)) > 0.995
 
@@ -77,7 +77,7 @@ def test_what_has_moved_is_what_the_cache_keeps():
 @pytest.mark.ci
 def test_flow_inside_the_objective_is_the_cached_flow(tmp_path: Path, clip):
     network = _panning_network()
-    weights = tmp_path / "flow.npz"
+    weights = tmp_path / "flow.safetensors"
     settings = {
         "_target_": "tagjax.flow.pyramid.PyramidFlow",
         "widths": [8, 8],
@@ -198,7 +198,7 @@ def test_a_joint_run_learns_both_resumes_exactly_and_is_evaluated_with_its_own_f
         before, after = (jax.tree.leaves(eqx.filter(getattr(m, part), eqx.is_inexact_array)) for m in (fresh, whole))
         assert any(np.any(np.asarray(a) != np.asarray(b)) for a, b in zip(before, after, strict=True))
     assert isinstance(whole, JointModel)
-    kept = load_network(tmp_path / "whole" / "flow.npz")
+    kept = load_network(tmp_path / "whole" / "flow.safetensors")
     for one, other in zip(jax.tree.leaves(kept), jax.tree.leaves(whole.network), strict=True):
         np.testing.assert_array_equal(one, other)
     # The held-out recording holds the flow of the untrained network and of those after one step and two.

@@ -116,7 +116,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         load(parameters={**good, "alpha": float("nan")})
     with pytest.raises(ValueError, match=r"missing \['beta'\], unknown \['gamma'\]"):
         load(parameters={**{name: value for name, value in good.items() if name != "beta"}, "gamma": 1.0})
-    with pytest.raises(ValueError, match=r"beta is 1\.5; expected a share from 0 to 1"):
+    with pytest.raises(ValueError, match=r"beta is 1\.5; expected a fraction from 0 to 1"):
         load(parameters={**good, "beta": 1.5})
     with pytest.raises(ValueError, match="positive value"):
         load(parameters={**good, "alpha": -1.0})

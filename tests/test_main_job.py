@@ -19,7 +19,7 @@ import synthetic_clips as synthetic
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.run import EvaluateConfig, run_evaluation
 from tagjax.recording import RecordingError, TagReads
-from tagjax.recording.opening import VirtualTagSettings, with_virtual_tags
+from tagjax.recording.loading import VirtualTagSettings, with_virtual_tags
 from tagjax.recording.reads import join_reads
 from tagjax.recording.store import save_recording
 from tagjax.tagattention import TagAttention
@@ -194,10 +194,10 @@ def test_label_pictures_are_whole_and_of_the_frames_size(tmp_path: Path) -> None
     second = tmp_path / "00000001.png"
     whole = second.read_bytes()
     second.write_bytes(whole[:-20])  # OpenCV reads this without a word
-    with pytest.raises(RecordingError, match=r"00000001\.png: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"00000001\.png: the image is truncated"):
         with_virtual_tags(recording, settings)
     cv2.imwrite(str(second), recording.truth.labels[1][:, :-1])
-    with pytest.raises(RecordingError, match=r"00000001\.png: a picture of \(24, 31\); expected \(24, 32\)"):
+    with pytest.raises(RecordingError, match=r"00000001\.png: an image of \(24, 31\); expected \(24, 32\)"):
         with_virtual_tags(recording, settings)
 
 
@@ -243,7 +243,7 @@ def test_reads_of_unlike_conventions_are_not_joined() -> None:
     both = join_reads([one, one[:3]])
     assert both.num_reads == one.num_reads + 3
     assert (both.time_ns[1:] >= both.time_ns[:-1]).all()
-    with pytest.raises(RecordingError, match="convert first"):
+    with pytest.raises(RecordingError, match="Convert them first"):
         join_reads([one, dataclasses.replace(TagReads.empty(), phase_sign=-1)])
 
 

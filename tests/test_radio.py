@@ -14,17 +14,24 @@ from radio_simulation import C, simulate_reads, smooth_path
 from scipy.interpolate import lagrange
 
 from tagjax.radio import refine, resample
+from tagjax.radio.bayes_filter import RadioModel, _fourier, filter_reads, reference_carrier
 from tagjax.radio.channels import estimate_slope
 from tagjax.radio.coherence import coherence, phase_likelihood, phase_residual
-from tagjax.radio.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
-from tagjax.radio.noise import pi_flip_share, thermal_sigma_rad
+from tagjax.radio.noise import estimate_flip_probability, thermal_sigma_rad
 from tagjax.radio.phase import distance_to_phase, phase_to_distance
 from tagjax.radio.reads import PhaseReads
 from tagjax.radio.refine import interpolation_weights
 from tagjax.radio.unwrap import remove_jump, unwrap_paper
 from tagjax.recording import TagReads
 from tagjax.tracing.motion_evidence import MIN_READS
-from tagjax.tracing.range_windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
+from tagjax.tracing.range_windows import (
+    paper_windows,
+    phase_reads,
+    radio_model,
+    radio_windows,
+    robust_windows,
+    window_reads,
+)
 
 # Compiled whole: operation by operation they take several times as long to compile.
 refine_path = eqx.filter_jit(refine.refine_path)
@@ -61,13 +68,13 @@ def test_noise_follows_the_measured_table():
     np.testing.assert_allclose(thermal_sigma_rad(np.array([-55.0, -65.0, -70.0])), [0.031, 0.074, 0.114], rtol=0.15)
 
 
-def test_flip_share_is_found():
+def test_flip_probability_is_estimated():
     rng = np.random.default_rng(0)
     time_s = np.arange(4000) * 0.02
     for share in (0.0, 0.05, 0.2):
         phase = np.mod(0.3 + rng.normal(0, 0.05, 4000) + np.pi * (rng.random(4000) < share), 2 * np.pi)
-        assert abs(pi_flip_share(phase, time_s, np.zeros(4000)) - share) < 0.02
-    assert np.isnan(pi_flip_share(np.zeros(3), np.arange(3.0), np.zeros(3)))
+        assert abs(estimate_flip_probability(phase, time_s, np.zeros(4000)) - share) < 0.02
+    assert np.isnan(estimate_flip_probability(np.zeros(3), np.arange(3.0), np.zeros(3)))
 
 
 def test_channel_slope_is_found_through_flips_and_motion():
@@ -172,13 +179,13 @@ def test_coherence_gradient_agrees_with_finite_differences(gradients_agree):
     gradients_agree(lambda r, w: coherence(r, w, channel, num_channels=3, multiple=2), (rng.uniform(0, 6, 20), weight))
 
 
-def _likelihood_by_search(residual, concentration, channel, flip_share) -> float:
+def _likelihood_by_search(residual, concentration, channel, flip_probability) -> float:
     """NumPy: each channel's offset by trying thousands."""
     total, offsets = 0.0, np.linspace(-np.pi, np.pi, 7201)[:-1]
     for c in set(channel):
         e, k = residual[channel == c], concentration[channel == c]
         towards = k * np.cos(e[None] - offsets[:, None])
-        either = np.log((1 - flip_share) * np.exp(towards) + flip_share * np.exp(-towards))
+        either = np.log((1 - flip_probability) * np.exp(towards) + flip_probability * np.exp(-towards))
         each = np.sum(either - np.log(np.i0(k)), axis=1)
         total += each.max()
     return total
@@ -192,12 +199,12 @@ def test_phase_likelihood_profiles_offsets_and_marginalises_flips(spread_rad):
     residual = rng.uniform(-np.pi, np.pi, 3)[channel] + rng.normal(0, spread_rad, 40) + flips
     concentration = rng.uniform(2, 10, 40)
     phases, known = jnp.asarray(residual, jnp.float32), jnp.asarray(concentration, jnp.float32)
-    found = phase_likelihood(phases, known, jnp.asarray(channel), num_channels=4, flip_share=0.1)
+    found = phase_likelihood(phases, known, jnp.asarray(channel), num_channels=4, flip_probability=0.1)
     np.testing.assert_allclose(found, _likelihood_by_search(residual, concentration, channel, 0.1), rtol=2e-3)
     # Where flips are as likely as not, turning reads by pi changes nothing.
-    even = phase_likelihood(phases, known, jnp.asarray(channel), num_channels=4, flip_share=0.5)
+    even = phase_likelihood(phases, known, jnp.asarray(channel), num_channels=4, flip_probability=0.5)
     turned = phases + jnp.pi * jnp.asarray(rng.integers(0, 2, 40), jnp.float32)
-    again = phase_likelihood(turned, known, jnp.asarray(channel), num_channels=4, flip_share=0.5)
+    again = phase_likelihood(turned, known, jnp.asarray(channel), num_channels=4, flip_probability=0.5)
     np.testing.assert_allclose(again, even, rtol=1e-4)
     assert float(found) > float(even)
 
@@ -210,7 +217,7 @@ def test_phase_likelihood_without_flips_is_that_of_the_phasor():
         jnp.asarray(concentration, jnp.float32),
         jnp.zeros(20, int),
         num_channels=2,
-        flip_share=1e-7,
+        flip_probability=1e-7,
     )
     phasor = np.abs(np.sum(concentration * np.exp(1j * residual), axis=-1))
     expected = phasor - np.sum(np.log(np.i0(concentration)))
@@ -218,13 +225,13 @@ def test_phase_likelihood_without_flips_is_that_of_the_phasor():
 
 
 def test_phase_likelihood_of_nothing_and_its_gradient(gradients_agree):
-    nothing = phase_likelihood(jnp.ones(5), jnp.zeros(5), jnp.zeros(5, int), num_channels=2, flip_share=0.05)
+    nothing = phase_likelihood(jnp.ones(5), jnp.zeros(5), jnp.zeros(5, int), num_channels=2, flip_probability=0.05)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-6)
     rng = np.random.default_rng(6)
     channel = jnp.asarray(rng.integers(0, 3, 12))
 
     def value(residual, concentration):
-        settled = {"num_channels": 3, "flip_share": 0.05, "num_iterations": 20}
+        settled = {"num_channels": 3, "flip_probability": 0.05, "num_iterations": 20}
         return phase_likelihood(residual, concentration, channel, **settled)
 
     gradients_agree(jax.jit(value), (rng.normal(0.5, 0.5, 12), rng.uniform(1, 8, 12)))

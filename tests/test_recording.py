@@ -19,10 +19,11 @@ import zarr
 
 from tagjax.flow import cache as flow_cache
 from tagjax.flow.cache import pair_flow
-from tagjax.flow.opencv import make_flow
+from tagjax.flow.registry import make_flow
 from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads, Truth, store
-from tagjax.recording.backwards import played_backwards
-from tagjax.recording.store import StoredFrames, open_recording, save_recording, write_recording
+from tagjax.recording.store import open_recording, save_recording, write_recording
+from tagjax.recording.stored_frames import StoredFrames
+from tagjax.recording.time_reversal import time_reversed
 from tagjax.tracing.clips import load_clip
 from tagjax.training.clip_dataset import clip_dataset
 
@@ -358,7 +359,7 @@ def test_truncated_and_foreign_stores_are_refused(recording, tmp_path):
 
 def test_missing_depth_is_said_and_refused_where_it_is_needed(recording, tmp_path):
     flat = dataclasses.replace(recording, depth=np.zeros_like(recording.depth))
-    with pytest.warns(RecordingWarning, match="no depth at all: TagAttention cannot trace here"):
+    with pytest.warns(RecordingWarning, match="no depth at all: only systems that need no depth"):
         flat.check()
     flat.check(depth=False)
     save_recording(flat, tmp_path / "flat.zarr")
@@ -548,9 +549,9 @@ def test_true_flow_is_what_the_recording_holds(recording):
     assert not backward[3, 5:9].any()
     np.testing.assert_array_equal(pair_flow(known, 2, 5, "truth")[1], backward[2:])
     np.testing.assert_array_equal(
-        pair_flow(played_backwards(known), 7, 9, "truth")[0], pair_flow(known, 4, 6, "truth")[1][::-1]
+        pair_flow(time_reversed(known), 7, 9, "truth")[0], pair_flow(known, 4, 6, "truth")[1][::-1]
     )
-    with pytest.raises(RecordingError, match="does not hold its true flow"):
+    with pytest.raises(RecordingError, match="has no true flow"):
         pair_flow(recording, 0, 2, "truth")
 
 
@@ -603,7 +604,7 @@ def test_flow_is_written_frame_by_frame(moving, monkeypatch):
         flow = make_flow(name)
 
         def compute(before, now):
-            written = [len(list(way.glob("c/*"))) for way in folder.glob(".*.partial/*ward")]
+            written = [len(list(way.glob("c/*"))) for way in folder.glob(".*.partial/array/*ward")]
             behind.append((len(behind) // 2 + 1, sorted(written)))
             return flow(before, now)
 
@@ -654,18 +655,21 @@ flow_cache.pair_flow(open_recording(sys.argv[1]), 0, 12, "dis_fast")
 """
 
 
-def test_flow_of_a_killed_process_is_never_read_and_swept_later(moving, monkeypatch):
+def test_partial_flow_of_a_killed_process_is_never_read_and_removed(moving, monkeypatch):
     path = Path(moving.store.store.root)
     killed = subprocess.run([sys.executable, "-c", _KILLED, str(path)], capture_output=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
-    (partial,) = (path / _CACHE.parent).iterdir()
+    folder = path / _CACHE.parent
+    assert {file.name for file in folder.iterdir()} == {".dis_fast.partial", ".dis_fast.lock"}
+    other = folder / ".farneback.partial"  # of another flow: it could be of a process that still runs
+    shutil.copytree(folder / ".dis_fast.partial", other)
     _agrees(open_recording(path))
-    assert partial.is_dir()  # it could be of a process that is still at work
+    assert {file.name for file in folder.iterdir()} == {"dis_fast", other.name}
     shutil.rmtree(path / _CACHE)
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + 7200)
     _agrees(open_recording(path))
-    assert not partial.exists()
+    assert {file.name for file in folder.iterdir()} == {"dis_fast"}
 
 
 def test_flow_of_other_shape_or_version_or_without_its_mark_is_computed_again(moving):
@@ -696,16 +700,16 @@ def test_damaged_flow_is_computed_again(moving):
     assert sorted(file.name for file in (path / _CACHE.parent).iterdir()) == ["dis_fast"]
 
 
-def test_two_that_fill_at_once_agree(moving, monkeypatch):
+def test_of_two_that_ask_at_once_one_computes(moving, monkeypatch):
     path = Path(moving.store.store.root)
-    meet = threading.Barrier(2, timeout=30)
-    write = flow_cache._fill
+    computed, compute = [], flow_cache._compute
 
-    def together(*args):
-        meet.wait()
-        write(*args)
+    def counting(recording, folder, *args):
+        computed.append(folder)
+        time.sleep(0.3)
+        compute(recording, folder, *args)
 
-    monkeypatch.setattr(flow_cache, "_fill", together)
+    monkeypatch.setattr(flow_cache, "_compute", counting)
     found: list = []
     threads = [
         threading.Thread(target=lambda: found.append(pair_flow(open_recording(path), 0, 12, "dis_fast")))
@@ -715,6 +719,7 @@ def test_two_that_fill_at_once_agree(moving, monkeypatch):
         thread.start()
     for thread in threads:
         thread.join()
+    assert len(computed) == 1
     assert len(found) == 2
     for both in found:
         for one, other in zip(both, _direct(moving), strict=True):

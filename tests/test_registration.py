@@ -11,10 +11,10 @@ import scipy.io
 
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.recording import Intrinsics, RecordingError
+from tagjax.recording.image_files import read_colour
 from tagjax.recording.importers.registration import estimate_correction, misalignment_px
 from tagjax.recording.importers.rgbd_folder import DepthToColour, load_calibration, read_mat_depth
 from tagjax.recording.importers.settings import ImportSettings, import_recording
-from tagjax.recording.picture_files import read_colour
 
 RESIDUAL = (-0.006, 0.004, 0.002, 1.004, 0.99, 8.5, -3.0)
 
@@ -150,9 +150,9 @@ def test_an_estimate_is_the_same_every_time(estimated) -> None:
 
 def test_a_room_in_which_nothing_moves_cannot_tell() -> None:
     colour, depth = Room(0, num_moving=0).frames(range(6), _told())
-    with pytest.raises(RecordingError, match="somebody walks"):
+    with pytest.raises(RecordingError, match="a person walks"):
         estimate_correction(colour, depth, _told())
-    with pytest.raises(RecordingError, match="Only 0 of 0 moving things"):
+    with pytest.raises(RecordingError, match="Only 0 of 0 moving objects"):
         misalignment_px(colour, depth, _told())
 
 

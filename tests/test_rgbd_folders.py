@@ -10,7 +10,15 @@ import scipy.io
 
 from tagjax.core.geometry import undistort
 from tagjax.recording import Intrinsics, RecordingError
-from tagjax.recording.importers.rgbd_folder import TUM_INTRINSICS, import_jpg_mat, import_tum, load_calibration, read_colour, read_labels, read_mat_depth
+from tagjax.recording.importers.rgbd_folder import (
+    TUM_INTRINSICS,
+    import_jpg_mat,
+    import_tum,
+    load_calibration,
+    read_colour,
+    read_labels,
+    read_mat_depth,
+)
 from tagjax.recording.store import open_recording, save_recording
 
 HEIGHT, WIDTH = 48, 64
@@ -116,7 +124,7 @@ def test_incomplete_folders_are_errors(folder, importing, tmp_path):
     with pytest.raises(RecordingError, match="positive frame rate"):
         importing(fps=0.0)
     (folder / "image002.mat").unlink()
-    with pytest.raises(RecordingError, match=r"1 of 4 pictures have no depth beside them \(no image002\.mat\)"):
+    with pytest.raises(RecordingError, match=r"1 of 4 images have no depth file \(no image002\.mat\)"):
         importing()
     with pytest.raises(RecordingError, match=r"no \.jpg file"):
         import_jpg_mat(tmp_path, folder / "cameras.mat", fps=10.0)
@@ -149,7 +157,7 @@ def test_what_follows_a_picture_and_what_precedes_it_does_not_matter(tmp_path):
         assert read_colour(path).shape == (HEIGHT, WIDTH, 3)
     # The end marker of a thumbnail in the header is not the picture's.
     path.write_bytes(with_thumbnail[: len(with_thumbnail) * 2 // 3])
-    with pytest.raises(RecordingError, match=r"a\.jpg: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"a\.jpg: the image is truncated"):
         read_colour(path)
 
 
@@ -159,10 +167,10 @@ def test_altered_and_foreign_pictures_are_errors(tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(bytes(data))
-    with pytest.raises(RecordingError, match=r"a\.png: the picture is cut short or damaged"):
+    with pytest.raises(RecordingError, match=r"a\.png: the image is truncated or damaged"):
         read_colour(path)
     path.write_text("no picture")
-    with pytest.raises(RecordingError, match=r"a\.png: no readable picture \(10 bytes\)"):
+    with pytest.raises(RecordingError, match=r"a\.png: no readable image \(10 bytes\)"):
         read_colour(path)
     with pytest.raises(RecordingError, match=r"b\.png: cannot be read"):
         read_colour(tmp_path / "b.png")
@@ -171,7 +179,7 @@ def test_altered_and_foreign_pictures_are_errors(tmp_path):
 def test_a_cut_picture_stops_the_import_before_it_is_in_a_recording(folder, importing, tmp_path):
     _cut(folder / "image002.jpg", 0.8)
     recording = importing()
-    with pytest.raises(RecordingError, match=r"image002\.jpg: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"image002\.jpg: the image is truncated"):
         recording.colour[1:4]
     with pytest.raises(RecordingError, match=r"image002\.jpg"):
         save_recording(recording, tmp_path / "a.zarr")
@@ -240,10 +248,10 @@ def test_a_calibration_that_lacks_something_is_an_error(tmp_path):
     path = tmp_path / "cameras.mat"
     for changes in ({"T": None}, {"Krgb": np.eye(2)}, {"T": np.zeros(4)}):
         _save_calibration(path, **changes)
-        with pytest.raises(RecordingError, match=r"cameras\.mat: cam_params lacks something"):
+        with pytest.raises(RecordingError, match=r"cameras\.mat: cam_params is incomplete"):
             load_calibration(path, (HEIGHT, WIDTH))
     scipy.io.savemat(path, {"cam_params": 3.0})
-    with pytest.raises(RecordingError, match="cam_params lacks something"):
+    with pytest.raises(RecordingError, match="cam_params is incomplete"):
         load_calibration(path, (HEIGHT, WIDTH))
     _save_calibration(path)
     _cut(path, 0.6)
@@ -281,7 +289,7 @@ def test_tum_pairs_pictures_with_the_nearest_depth(tmp_path):
     assert np.all(recording.depth[0][200:240, 300:340] == 0)
     np.testing.assert_array_equal(recording.colour[0], _picture(1, (480, 640)))
     np.testing.assert_array_equal(recording.colour[2], _picture(2, (480, 640)))
-    assert "1 of 4 pictures without depth left out" in recording.source
+    assert "1 of 4 images without depth left out" in recording.source
     assert recording.intrinsics == Intrinsics(535.4, 539.2, 320.1, 247.6, 640, 480)
     assert import_tum(folder, max_gap_s=0.003).num_frames == 1
     assert import_tum(folder, max_gap_s=0.2).num_frames == 4
@@ -309,7 +317,7 @@ def test_tum_lens_distortion_is_undone(tmp_path, camera):
 
     recording = import_tum(folder, camera=camera)
     assert recording.intrinsics == ideal
-    assert f"distortion of {camera} undone" in recording.source
+    assert f"distortion of {camera} removed" in recording.source
     colour, depth = recording.colour[0], recording.depth[0]
     np.testing.assert_array_equal(colour[row, column], [200, 100, 50])
     assert depth[row, column] == 1000
@@ -326,7 +334,7 @@ def test_tum_folders_that_cannot_be_used_are_errors(tmp_path):
     with pytest.raises(RecordingError, match="unknown TUM camera 'kinect'"):
         import_tum(folder, camera="kinect")
     _cut(folder / "rgb" / "2.000.png", 0.5)
-    with pytest.raises(RecordingError, match=r"2\.000\.png: the picture is cut short"):
+    with pytest.raises(RecordingError, match=r"2\.000\.png: the image is truncated"):
         import_tum(folder).colour[1]
     cv2.imwrite(str(folder / "depth" / "2.000.png"), np.zeros((480, 640), np.uint8))
     with pytest.raises(RecordingError, match=r"2\.000\.png: uint8 of shape"):

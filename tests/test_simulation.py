@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.radio.noise import pi_flip_share
+from tagjax.radio.noise import estimate_flip_probability
 from tagjax.radio.reader import DWELL_S, ReaderSettings, ReaderState, channel_at, noise_sigma_rad, read_times
 from tagjax.recording import RecordingError
 from tagjax.recording.virtual_tags import Track, attach_virtual_tags, load_tracks_csv, virtual_reads
@@ -44,7 +44,7 @@ def test_static_tag_repeats_its_phase_within_a_channel():
 
 def test_pi_flips_have_their_probability():
     reads = virtual_reads(STILL, "A", ReaderSettings(flip_probability=0.1), seed=0, antenna_m=np.zeros(3))
-    share = pi_flip_share(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index)
+    share = estimate_flip_probability(reads.phase_rad, reads.time_ns * 1e-9, reads.channel_index)
     assert abs(share - 0.1) < 0.03
 
 

@@ -17,8 +17,8 @@ from tagjax.core.settings import ConfigError
 from tagjax.flow.cache import pair_flow
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.recording import Recording, RecordingError
-from tagjax.recording.backwards import played_backwards
 from tagjax.recording.store import open_recording
+from tagjax.recording.time_reversal import time_reversed
 from tagjax.tagattention import TagAttention
 from tagjax.tagattention.paper import TagAttentionPaper
 from tagjax.tracing.clips import Clip, ClipSettings, load_clip
@@ -56,9 +56,9 @@ def _outlines(mask: np.ndarray, box: tuple[int, int, int, int]) -> float:
 
 
 def test_twice_backwards_is_forwards(recording: Recording) -> None:
-    back = played_backwards(recording)
+    back = time_reversed(recording)
     back.check()
-    again = played_backwards(back)
+    again = time_reversed(back)
     np.testing.assert_array_equal(again.time_ns, recording.time_ns)
     for field in dataclasses.fields(recording.reads):
         np.testing.assert_array_equal(getattr(again.reads, field.name), getattr(recording.reads, field.name))
@@ -84,7 +84,7 @@ def test_a_clock_that_goes_backwards_turns_doppler_and_keeps_phases(recording: R
         doppler_hz=np.arange(recording.reads.num_reads, dtype=np.float32),
         reader_time_ns=recording.reads.time_ns + 5,
     )
-    back = played_backwards(recording.with_reads(reads)).reads
+    back = time_reversed(recording.with_reads(reads)).reads
     back.check()
     np.testing.assert_array_equal(back.phase_rad, reads.phase_rad[::-1])
     np.testing.assert_array_equal(back.doppler_hz, -reads.doppler_hz[::-1])
@@ -106,9 +106,9 @@ def test_flow_backwards_is_the_same_pairs_the_other_way_round() -> None:
         intrinsics=dataclasses.replace(still.intrinsics, **size),
         truth=None,
     )
-    back = played_backwards(recording)
+    back = time_reversed(recording)
     # The same pictures as a recording of its own: DIS does not know which way time runs.
-    alone = dataclasses.replace(back, forwards=None)
+    alone = dataclasses.replace(back, reversed_from=None)
     for first, last in ((0, 5), (0, 1), (2, 4)):
         for turned, expected in zip(
             pair_flow(back, first, last, "dis"), pair_flow(alone, first, last, "dis"), strict=True
@@ -120,8 +120,8 @@ def test_flow_backwards_is_the_same_pairs_the_other_way_round() -> None:
 
 def test_the_radio_backwards_tells_the_distances_backwards(recording: Recording) -> None:
     """By an independent way: the reads of the turned recording give the truth's differences, frames reversed."""
-    clip = load_clip(played_backwards(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
-    truth = load_clip(played_backwards(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS, estimator="truth")
+    clip = load_clip(time_reversed(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
+    truth = load_clip(time_reversed(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS, estimator="truth")
     time_s = recording.frame_time_s()
     for tag, label in enumerate(synthetic.BOXES):
         travelled = synthetic.offset_m(label, time_s)[::-1]
@@ -139,7 +139,7 @@ def test_past_and_future_add_up_to_all_there_is(recording: Recording) -> None:
         memory_s=1e9, evidence_limit=1e6, phase_weight=1e-12, coherent_weight=1e-12, anchor_rate=1e-12, v0_m_s=1e-6
     )  # fmt: skip
     settings = {"stride": 1, "flow": "zero", "epcs": EPCS, "estimator": "truth", "window": 2}
-    ways = [load_clip(one, 0, NUM_FRAMES, **settings) for one in (recording, played_backwards(recording))]
+    ways = [load_clip(one, 0, NUM_FRAMES, **settings) for one in (recording, time_reversed(recording))]
     forwards = eqx.filter_jit(
         lambda frames: jax.lax.scan(
             lambda state, frame: (after := tracer.step(ways[0].camera, state, frame)[0], after.log_odds),
@@ -186,7 +186,7 @@ def test_pieces_and_groups_give_what_two_scans_give(recording: Recording) -> Non
     tracer = _tracer(rivalry=1e-12)  # so that tags can be traced one at a time
     settings = ScoreSettings(frames_at_once=7, tags_at_once=1, smooth=True)
     pieces = list(trace_recording(tracer, recording, _load, epcs=EPCS, settings=settings))
-    clip, turned = (_load(one, 0, NUM_FRAMES, epcs=EPCS) for one in (recording, played_backwards(recording)))
+    clip, turned = (_load(one, 0, NUM_FRAMES, epcs=EPCS) for one in (recording, time_reversed(recording)))
     later = _back(tracer, turned.camera, turned.frames)
     whole = eqx.filter_jit(trace)(tracer, clip.camera, dataclasses.replace(clip.frames, backward_message=later))
     for number, out in pieces:
@@ -197,7 +197,7 @@ def test_pieces_and_groups_give_what_two_scans_give(recording: Recording) -> Non
 @pytest.mark.slow
 def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
     clip = load_clip(recording, 0, 6, stride=1, flow="zero", epcs=EPCS)
-    turned = load_clip(played_backwards(recording), NUM_FRAMES - 6, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
+    turned = load_clip(time_reversed(recording), NUM_FRAMES - 6, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
 
     @eqx.filter_jit
     @eqx.filter_grad

@@ -90,7 +90,7 @@ def test_every_format_says_the_same(tmp_path, name, encoding):
 
 def test_a_named_format_overrides_and_an_unknown_one_is_refused(tmp_path):
     path = _write(tmp_path / "table", TABLES["octane"])
-    with pytest.raises(RecordingError, match="2 of 2 rows are no tagbeat"):
+    with pytest.raises(RecordingError, match="2 of 2 rows are not valid tagbeat"):
         import_table(path, format="tagbeat")
     with pytest.raises(RecordingError, match="Unknown format"):
         import_table(path, format="nonsense")
@@ -108,7 +108,7 @@ def test_rejected_rows_are_counted_by_reason(tmp_path):
     assert reads.num_reads == 10
     assert sum(report.rejected.values()) == 5
     assert report.rejected["phase_angle is outside 0 to 4095 codes"] == 1
-    assert report.rejected["EPC is no hexadecimal number"] == 2
+    assert report.rejected["EPC is not hexadecimal"] == 2
     assert report.rejected["RSSI is outside -120 to 20 dBm: wrong unit?"] == 1
     assert report.rejected["phase_angle is not finite"] == 1
 
@@ -128,7 +128,7 @@ def test_a_table_without_phases_says_how_to_get_them(tmp_path):
 def test_other_events_of_the_r700_are_counted(tmp_path):
     lines = [*TABLES["r700"], json.dumps({"timestamp": "2023-11-14T22:13:21Z", "eventType": "inventoryStatus"})]
     _, _, report = import_table(_write(tmp_path / "t", lines))
-    assert report.rejected == {"event is no tag inventory": 1}
+    assert report.rejected == {"event is not a tag inventory": 1}
 
 
 def test_channel_indices_need_the_hop_table(tmp_path):

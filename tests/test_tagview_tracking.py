@@ -13,7 +13,33 @@ import numpy as np
 import pytest
 
 from tagjax.baselines import HostCamera, HostFrame, host_trace
-from tagjax.baselines.tagview import AbstractDetector, BoxDetector, BoxNetwork, BoxTracks, DetectorSettings, LabelledFrame, MatchSettings, MotionDetector, SortSettings, TagviewSettings, TagviewTracer, TrainSettings, detection_loss, from_inclusive, labelled_frames, load_detector, make_detector, measure_detector, middle_px, overlap, save_detector, suppress, track_boxes, train_detector, undistorted
+from tagjax.baselines.tagview import (
+    AbstractDetector,
+    BoxDetector,
+    BoxNetwork,
+    BoxTracks,
+    DetectorSettings,
+    LabelledFrame,
+    MatchSettings,
+    MotionDetector,
+    SortSettings,
+    TagviewSettings,
+    TagviewTracer,
+    TrainSettings,
+    detection_loss,
+    from_inclusive,
+    labelled_frames,
+    load_detector,
+    make_detector,
+    measure_detector,
+    middle_px,
+    overlap,
+    save_detector,
+    suppress,
+    track_boxes,
+    train_detector,
+    undistorted,
+)
 from tagjax.baselines.tagview._anchors import decode, default_boxes, encode, targets
 from tagjax.evaluation.tagview import Matching, TagviewExperiment, run_tagview, table, true_stretches, watch
 from tagjax.evaluation.tagview._judge import owners
@@ -158,8 +184,8 @@ def test_training_learns_and_weights_come_back(tmp_path):
     assert recipe["steps_done"] == 60
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])
     about = {"network": {"widths": [4, 8, 8], "depth": 1}, "recipe": recipe}
-    save_detector(tmp_path / "d.npz", network, about)
-    again, told = load_detector(tmp_path / "d.npz")
+    save_detector(tmp_path / "d.safetensors", network, about)
+    again, told = load_detector(tmp_path / "d.safetensors")
     assert told["recipe"]["num_steps"] == 60
     for one, other in zip(jax.tree.leaves(network), jax.tree.leaves(again), strict=True):
         np.testing.assert_allclose(one, other, atol=2e-3)
@@ -172,25 +198,25 @@ def test_training_learns_and_weights_come_back(tmp_path):
 
 
 def test_foreign_weights_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="no weights"):
-        load_detector(tmp_path / "missing.npz")
-    (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(ValueError, match="no weights"):
-        load_detector(tmp_path / "text.npz")
+    with pytest.raises(ValueError, match="no readable weights"):
+        load_detector(tmp_path / "missing.safetensors")
+    (tmp_path / "text.safetensors").write_text("hello")
+    with pytest.raises(ValueError, match="no readable weights"):
+        load_detector(tmp_path / "text.safetensors")
     np.savez(tmp_path / "other.npz", a=np.ones(3))
-    with pytest.raises(ValueError, match="no weights"):
+    with pytest.raises(ValueError, match="no readable weights"):
         load_detector(tmp_path / "other.npz")
     network = BoxNetwork((4, 6, 8), 1, key=jax.random.key(0))
-    save_detector(tmp_path / "small.npz", network, {"network": {"widths": [4, 6, 9], "depth": 1}})
+    save_detector(tmp_path / "small.safetensors", network, {"network": {"widths": [4, 6, 9], "depth": 1}})
     with pytest.raises(
         ValueError, match=r"float16 of shape \(3, 3, 6, 8\); this network has floats of shape \(3, 3, 6, 9\)"
     ):
-        load_detector(tmp_path / "small.npz")
+        load_detector(tmp_path / "small.safetensors")
     broken = eqx.tree_at(lambda n: n.head.bias, network, jnp.full(20, jnp.nan))
     with pytest.raises(ValueError, match="not finite"):
-        save_detector(tmp_path / "nan.npz", broken, {"network": {"widths": [4, 6, 8], "depth": 1}})
+        save_detector(tmp_path / "nan.safetensors", broken, {"network": {"widths": [4, 6, 8], "depth": 1}})
     with pytest.raises(ValueError, match="network"):
-        save_detector(tmp_path / "bare.npz", network, {})
+        save_detector(tmp_path / "bare.safetensors", network, {})
 
 
 @pytest.mark.parametrize(
@@ -209,9 +235,9 @@ def test_foreign_weights_are_refused(tmp_path):
     ],
 )
 def test_a_file_of_a_network_that_is_none_is_refused_before_it_is_built(tmp_path, network):
-    save_detector(tmp_path / "odd.npz", BoxNetwork((4, 6, 8), 1, key=jax.random.key(0)), {"network": network})
-    with pytest.raises(ValueError, match=r"odd\.npz: does not say which network .* depth of 1 to 32"):
-        load_detector(tmp_path / "odd.npz")
+    save_detector(tmp_path / "odd.safetensors", BoxNetwork((4, 6, 8), 1, key=jax.random.key(0)), {"network": network})
+    with pytest.raises(ValueError, match=r"odd\.safetensors: does not say which network .* depth of 1 to 32"):
+        load_detector(tmp_path / "odd.safetensors")
 
 
 def test_the_packaged_detector_is_small_and_says_where_it_comes_from():

@@ -15,7 +15,26 @@ import tagvision_scenes as scenes
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax.baselines.tagvision import BlobSettings, Board, CalibrateSettings, MatchSettings, Snapshots, TagVisionSettings, TrackSettings, draw_snapshots, heading, hop_slope, match_scores, match_tags, nearest_reads, pair_interpolated, pair_nearest, phase_score, residuals_rad, theory_rad
+from tagjax.baselines.tagvision import (
+    BlobSettings,
+    Board,
+    CalibrateSettings,
+    MatchSettings,
+    Snapshots,
+    TagVisionSettings,
+    TrackSettings,
+    draw_snapshots,
+    heading,
+    hop_slope,
+    match_scores,
+    match_tags,
+    nearest_reads,
+    pair_interpolated,
+    pair_nearest,
+    phase_score,
+    residuals_rad,
+    theory_rad,
+)
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.tagvision import LineSettings, TagVisionExperiment, line_scores, run_tagvision
 

@@ -13,8 +13,30 @@ import cv2
 import numpy as np
 import pytest
 
-from tagjax.baselines.tagvision import Board, CalibrateSettings, CalibrationError, PlaneCamera, PosePicture, calibrate, calibrate_folder, find_corners, load_camera, locate, read_picture, save_camera, write_calibration, write_corners
-from tagjax.evaluation.tagvision import PAPER_CAMERA, CalibrationSettings, board_views, calibrated, overhead, transform_error_m
+from tagjax.baselines.tagvision import (
+    Board,
+    CalibrateSettings,
+    CalibrationError,
+    PlaneCamera,
+    PosePicture,
+    calibrate,
+    calibrate_folder,
+    find_corners,
+    load_camera,
+    locate,
+    read_picture,
+    save_camera,
+    write_calibration,
+    write_corners,
+)
+from tagjax.evaluation.tagvision import (
+    PAPER_CAMERA,
+    CalibrationSettings,
+    board_views,
+    calibrated,
+    overhead,
+    transform_error_m,
+)
 from tagjax.recording import Intrinsics
 
 ROOT = Path(__file__).parents[1]

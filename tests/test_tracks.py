@@ -14,8 +14,30 @@ import pytest
 import yaml
 
 from tagjax.core.settings import from_mapping
-from tagjax.evaluation.real_tags import SCORES, align, associate, heard_speed, places_around, speed_scores, speed_windows
-from tagjax.evaluation.tracks import METHODS, Scene, TracksConfig, antenna_place, association_scores, load_kinect, load_scenes, load_xovis, real_tags_markdown, right, run_real_tags, run_tracks, windows
+from tagjax.evaluation.real_tags import (
+    SCORES,
+    align,
+    associate,
+    heard_speed,
+    places_around,
+    speed_scores,
+    speed_windows,
+)
+from tagjax.evaluation.tracks import (
+    METHODS,
+    Scene,
+    TracksConfig,
+    antenna_place,
+    association_scores,
+    load_kinect,
+    load_scenes,
+    load_xovis,
+    real_tags_markdown,
+    right,
+    run_real_tags,
+    run_tracks,
+    windows,
+)
 from tagjax.recording import RecordingError
 from tagjax.recording.importers.tagged_walks import Speeds, Walk, load_tagged, load_uwb
 from tagjax.tagattention.attention import coherent_score
@@ -164,7 +186,13 @@ def test_the_configuration_names_every_setting():
 def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path):
     """Without noise, flips or hops a window of 4 s suffices for all of them; a run writes what it found."""
     config = TracksConfig(
-        str(folder), windows_s=(4.0,), frame_rate_hz=RATE_HZ, max_windows=6, noise_m=0.0, flip_probability=0.0, region="fixed"
+        str(folder),
+        windows_s=(4.0,),
+        frame_rate_hz=RATE_HZ,
+        max_windows=6,
+        noise_m=0.0,
+        flip_probability=0.0,
+        region="fixed",
     )
     rows = run_tracks(config, tmp_path, on_done=lambda name: None)["rows"]
     assert [row["scene"] for row in rows] == ["kinect-rfid", "xovis-uwb"]

@@ -25,7 +25,23 @@ from tagjax.recording import RecordingError
 from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
 from tagjax.training.loop import DivergedError, LoopSettings, resumed, train
-from tagjax.training.loss import TERM_NAMES, TERMS, ObjectiveSettings, agreement, area, calibration, clip_reads, compactness, contrast, coverage, distance_at, future_agreement, objective, see, steadiness
+from tagjax.training.loss import (
+    TERM_NAMES,
+    TERMS,
+    ObjectiveSettings,
+    agreement,
+    area,
+    calibration,
+    clip_reads,
+    compactness,
+    contrast,
+    coverage,
+    distance_at,
+    future_agreement,
+    objective,
+    see,
+    steadiness,
+)
 from tagjax.training.state import TrainState
 from tagjax.training.step import clip_gradient, clip_loss, make_optimizer, train_step
 

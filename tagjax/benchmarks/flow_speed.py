@@ -13,8 +13,8 @@ import optax
 
 from ..flow.estimates import NetworkFlow, flow_along
 from ..flow.losses import FlowLossSettings
-from ..flow.named import make_flow
 from ..flow.pyramid import PyramidFlow
+from ..flow.registry import make_flow
 from ..training.flow_step import FlowTrainState, flow_step
 from .timing import Timing, first_call_s, in_own_process, medians_ms, peak_memory_mib
 
@@ -46,7 +46,7 @@ def _step(seed: int) -> Callable[[], Any]:
     optimizer = optax.adam(1e-3)
     held = [FlowTrainState.create(PyramidFlow(seed=seed), optimizer, seed=seed)]
     pairs = [np.stack(moved_pictures(_ROWS, _COLUMNS, 2, seed + n)) for n in range(_BATCH)]
-    samples = [{"clean": pair, "seen": pair} for pair in pairs]
+    samples = [{"clean": pair, "augmented": pair} for pair in pairs]
 
     def step() -> float:
         held[0], numbers = flow_step(held[0], samples, optimizer, FlowLossSettings(), _AVERAGE_OVER)

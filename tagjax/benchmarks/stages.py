@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..flow.named import make_flow
+from ..flow.registry import make_flow
 from ..image.warp import gather, splat
 from ..radio.coherence import coherence
 from ..sim.flow_pairs import FlowPairSettings, flow_pairs

@@ -11,7 +11,7 @@ import numpy as np
 
 from .errors import RecordingError
 
-_LENSES = (0, 4, 5, 8, 12, 14)
+_NUM_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
 
 
 def _finite(value: Any) -> bool:
@@ -47,16 +47,16 @@ class Intrinsics:
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]], dtype=np.float64)
 
     def check(self) -> None:
-        """Raise `RecordingError` for what no camera has."""
+        """Raise `RecordingError` for values that no camera has."""
         if not all(isinstance(side, numbers.Integral) and side > 0 for side in (self.width, self.height)):
-            raise RecordingError(f"Intrinsics: {self.width} x {self.height}; expected a picture's size, whole pixels.")
+            raise RecordingError(f"Intrinsics: {self.width} x {self.height}; expected positive integers.")
         for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
             value = getattr(self, name)
             if not _finite(value) or (name in ("fx_px", "fy_px") and value <= 0):
                 kind = "positive" if name in ("fx_px", "fy_px") else "finite"
                 raise RecordingError(f"Intrinsics: {name} is {value!r}; expected a {kind} number of pixels.")
-        if len(self.distortion) not in _LENSES or not all(map(_finite, self.distortion)):
+        if len(self.distortion) not in _NUM_COEFFICIENTS or not all(map(_finite, self.distortion)):
             raise RecordingError(
-                f"Intrinsics: distortion is {self.distortion!r}; expected finite k1 k2 p1 p2 k3, as many as OpenCV takes "
-                f"({', '.join(map(str, _LENSES))})."
+                f"Intrinsics: distortion is {self.distortion!r}; expected finite k1 k2 p1 p2 k3, in a number that OpenCV takes "
+                f"({', '.join(map(str, _NUM_COEFFICIENTS))})."
             )

@@ -1,4 +1,4 @@
-"""The machine that a figure was measured on."""
+"""Description of the machine, for measurements."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import jax
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    import cv2  # `import tagjax` must not pull in OpenCV
+    """Platform, processor, cores, load, devices and versions of JAX and OpenCV."""
+    import cv2  # `import tagjax` must not import OpenCV
 
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     return {

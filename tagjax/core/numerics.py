@@ -1,4 +1,4 @@
-"""Gradient-safe elementary functions: finite value and gradient at the degenerate input as well."""
+"""Gradient-safe elementary functions: finite value and gradient also at degenerate inputs."""
 
 from __future__ import annotations
 
@@ -34,15 +34,8 @@ def safe_atan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Ar
 
 
 def wrap_to_pi(angle_rad: Float[Array, "*shape"], period_rad: float = 2 * jnp.pi) -> Float[Array, "*shape"]:
-    """Angle wrapped to [-period/2, period/2); gradient 1 everywhere (the jumps carry none)."""
+    """Angle wrapped to [-period/2, period/2); gradient 1 everywhere (the jumps have none)."""
     return angle_rad - period_rad * jax.lax.stop_gradient(jnp.floor(angle_rad / period_rad + 0.5))
-
-
-def circular_mean(
-    angle_rad: Float[Array, "*shape axis"], weight: Float[Array, "*#shape axis"]
-) -> Float[Array, "*shape"]:
-    """Direction of the weighted resultant over the last axis; 0 where the resultant vanishes."""
-    return safe_atan2(jnp.sum(weight * jnp.sin(angle_rad), axis=-1), jnp.sum(weight * jnp.cos(angle_rad), axis=-1))
 
 
 def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -51,7 +44,7 @@ def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 def logit(probability: float) -> float:
-    """Log odds of a Python probability in (0, 1); for the unconstrained initial value of a parameter."""
+    """Log odds of a probability in (0, 1), the initial value of an unconstrained parameter. Raises `ValueError` otherwise."""
     if not 0.0 < probability < 1.0:
-        raise ValueError(f"A probability strictly between 0 and 1 is needed; found {probability}.")
+        raise ValueError(f"The probability is {probability}; expected a value strictly between 0 and 1.")
     return float(jnp.log(probability) - jnp.log1p(-probability))

@@ -1,4 +1,4 @@
-"""Endless streams of samples from any place on, read by this process or by worker processes."""
+"""Endless streams of samples that start at any position, read by this process or by worker processes."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ import grain
 import jax
 from absl import flags
 
-_LAST_STEP_S = 60.0
-"""A worker that got SIGTERM gives samples for so long."""
+_GRACE_PERIOD_S = 60.0
+"""A worker that got SIGTERM goes on serving samples for so long."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Stream:
-    """An endless dataset with what is needed to read it; iterating gives a `StreamIterator`."""
+    """An endless dataset and how it is read; `iter` returns a `StreamIterator`. Raises `ValueError` for negative workers."""
 
-    dataset: grain.MapDataset  # endless: what comes at each place follows from the place alone
-    workers: int = 0  # processes that read ahead; with none a thread of this process does
-    ahead: int = 2  # samples read ahead, by each worker if there are some
-    share: tuple[int, int] = (0, 1)  # (i, n) takes every n-th sample from the i-th on
-    finish: Callable[[Any], Any] | None = None  # done to every sample in this process, after the workers
+    dataset: grain.MapDataset  # endless: a sample depends on its position alone
+    workers: int = 0  # processes that prefetch; with 0 a thread of this process does
+    prefetch: int = 2  # samples read ahead, by each worker if there are any
+    shard: tuple[int, int] = (0, 1)  # (i, n): every n-th sample, from the i-th on
+    transform: Callable[[Any], Any] | None = None  # applied to every sample in this process, after the workers
 
     def __post_init__(self) -> None:
         if self.workers < 0:
@@ -39,13 +39,13 @@ class Stream:
 
 
 class StreamIterator:
-    """Samples in order. Its place is the number of samples that all shares together have drawn, and nothing else.
+    """Samples in order. The only state is the position: the number of samples that all shards together have drawn.
 
-    So a run may go on with another number of workers, or of processes that share the stream.
+    So a run may resume with another number of workers or shards.
     """
 
     def __init__(self, stream: Stream):
-        self._stream, self._place, self._samples = stream, 0, None
+        self._stream, self._position, self._samples = stream, 0, None
 
     def __iter__(self) -> StreamIterator:
         return self
@@ -54,58 +54,59 @@ class StreamIterator:
         if self._samples is None:
             self._samples = self._open()
         sample = next(self._samples)
-        self._place += self._stream.share[1]
-        return sample if self._stream.finish is None else self._stream.finish(sample)
+        self._position += self._stream.shard[1]
+        return sample if self._stream.transform is None else self._stream.transform(sample)
 
     def get_state(self) -> dict[str, int]:
-        return {"samples": self._place}
+        """The position, for `set_state`."""
+        return {"samples": self._position}
 
     def set_state(self, state: Any) -> None:
-        """Go on at that place. Raises `ValueError` for what is none."""
-        place = state.get("samples", state.get("next_index")) if isinstance(state, dict) else None
-        if not isinstance(place, int) or place < 0:
-            raise ValueError(f"The place in the data is {state!r}; expected {{'samples': <number drawn>}}.")
+        """Continue at the position of `get_state`. Raises `ValueError` for anything else."""
+        position = state.get("samples", state.get("next_index")) if isinstance(state, dict) else None
+        if not isinstance(position, int) or position < 0:
+            raise ValueError(f"The position in the data is {state!r}; expected {{'samples': <number drawn>}}.")
         self.close()
-        self._place = place
+        self._position = position
 
     def close(self) -> None:
-        """Ends the worker processes."""
+        """End the worker processes."""
         if self._samples is not None:
             self._samples.close()
             self._samples = None
 
     def _open(self) -> Any:
         stream = self._stream
-        first, step = stream.share
-        part = stream.dataset[self._place + first :: step]
-        samples = part.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=stream.ahead))
+        first, step = stream.shard
+        part = stream.dataset[self._position + first :: step]
+        samples = part.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=stream.prefetch))
         if stream.workers:
-            # Grain asks flags of Abseil, which only Abseil's own programs parse.
+            # Grain reads Abseil's flags, which only Abseil's own programs parse.
             if not flags.FLAGS.is_parsed():
                 flags.FLAGS.mark_as_parsed()
-            options = grain.MultiprocessingOptions(num_workers=stream.workers, per_worker_buffer_size=stream.ahead)
+            options = grain.MultiprocessingOptions(num_workers=stream.workers, per_worker_buffer_size=stream.prefetch)
             samples = samples.mp_prefetch(options, worker_init_fn=_begin_worker)
         return iter(samples)
 
 
 def _begin_worker(index: int, count: int) -> None:
-    """Workers compute on the host, leave Ctrl-C to the training process, and do not outlive it, however it ends.
+    """Set up a worker: it computes on the CPU, ignores Ctrl-C, and ends when the training process ends.
 
-    A scheduler sends SIGTERM to all processes: the step in progress still needs its samples.
+    A scheduler sends SIGTERM to all processes: the training step in progress still needs its samples.
     """
     del index, count
     jax.config.update("jax_platforms", "cpu")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda number, frame: threading.Thread(target=leave, daemon=True).start())
+    signal.signal(signal.SIGTERM, lambda number, frame: threading.Thread(target=exit_later, daemon=True).start())
     parent = multiprocessing.parent_process()
     assert parent is not None
 
-    def leave() -> None:
-        time.sleep(_LAST_STEP_S)
+    def exit_later() -> None:
+        time.sleep(_GRACE_PERIOD_S)
         os._exit(1)
 
-    def follow() -> None:
+    def exit_with_parent() -> None:
         multiprocessing.connection.wait([parent.sentinel])
         os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()

@@ -1,4 +1,4 @@
-"""Shape aliases and axis conventions shared by the whole package.
+"""The type of lazily read arrays, and the axis conventions of the whole package.
 
 Axes: images are ``height width [channel]``; points and flow put x (right) before y (down); pixel centres lie at
 integers. SI units, named by the last suffix of a variable: ``depth_m``, ``phase_rad``, ``carrier_hz``, ``time_s``.
@@ -6,32 +6,14 @@ integers. SI units, named by the last suffix of a variable: ``depth_m``, ``phase
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
-
-DepthMap: TypeAlias = Float[Array, "height width"]
-"""Depth z along the optical axis, metres, 0 = missing."""
-
-RangeMap: TypeAlias = Float[Array, "height width"]
-"""Distance to the sensor origin, metres, 0 = missing. Not depth."""
-
-FlowField: TypeAlias = Float[Array, "height width 2"]
-"""Optical flow, pixels: [..., 0] = dx (right), [..., 1] = dy (down)."""
-
-PointMap: TypeAlias = Float[Array, "height width 3"]
-"""Points (x right, y down, z forward), metres, camera frame."""
-
-PixelMask: TypeAlias = Bool[Array, "height width"]
-
-Metadata: TypeAlias = Mapping[str, Any]
 
 
 @runtime_checkable
 class LazyArray(Protocol):
-    """What a stored array offers without being read: NumPy and Zarr arrays both do."""
+    """An array whose values are read when it is indexed; NumPy and Zarr arrays are examples."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...

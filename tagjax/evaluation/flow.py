@@ -17,8 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from ..core.machine import machine
-from ..flow.named import flow_key, make_flow, taken_apart
 from ..flow.opencv import FlowFunction
+from ..flow.registry import flow_key, make_flow, split_suffixes
 from ..metrics.flow import FlowScores, endpoint_error, warped_error
 from ..report.flow import flow_panel
 from ..report.report import write_json
@@ -144,8 +144,8 @@ def _labels(names: Sequence[str]) -> dict[str, str]:
     """Short names of flows: weights by the name of their file, or by the whole path where two share it."""
     short = []
     for name in names:
-        flow, rest = taken_apart(name)
-        short.append(Path(flow).stem + rest if Path(flow).suffix == ".npz" else name)
+        flow, rest = split_suffixes(name)
+        short.append(Path(flow).stem + rest if Path(flow).suffix == ".safetensors" else name)
     return {stem if short.count(stem) == 1 else name: name for stem, name in zip(short, names, strict=True)}
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
 from ..flow.flo_files import read_flo
-from ..flow.picture_pairs import open_sequence
-from ..flow.pictures import check_pictures
+from ..flow.image_sequences import open_sequence
+from ..flow.images import check_images
 from ..recording import RecordingError
 from ..recording.store import open_recording
 from ..sim.flow_pairs import FlowPairSettings, flow_pairs
@@ -140,4 +140,4 @@ def _picture(path: Path) -> np.ndarray:
     if picture is None:
         raise RecordingError(f"{path} is missing or cannot be read as a picture.")
     picture = np.ascontiguousarray(picture[..., ::-1])
-    return picture if picture.dtype == np.uint8 else check_pictures(picture, picture)[0]
+    return picture if picture.dtype == np.uint8 else check_images(picture, picture)[0]

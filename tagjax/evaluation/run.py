@@ -10,7 +10,7 @@ from typing import Any
 from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
-from ..recording.opening import VirtualTagSettings, opened
+from ..recording.loading import VirtualTagSettings, open_recordings
 from ..tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
 from ..tracing.clips import ClipSettings
 from ..training.checkpoint import Checkpoints
@@ -34,7 +34,7 @@ def held_out(data: DataSettings) -> list[Recording]:
     """The recordings that a run held out, without a look at those that it learned from."""
     if not data.recordings:
         return training_recordings(data)[1]
-    return opened(data.validation, data.virtual_tag)
+    return open_recordings(data.validation, data.virtual_tag)
 
 
 def run_evaluation(
@@ -55,7 +55,7 @@ def run_evaluation(
         trained = from_mapping(TrainConfig, run_values)
         state = restore_state(Path(config.run), trained, step=config.checkpoint)
         tracers = {"learned": state.tracer}
-        flows = {"learned": own_flow(state.model, trained, folder / "flow.npz")}
+        flows = {"learned": own_flow(state.model, trained, folder / "flow.safetensors")}
         clips, scores = trained.data.clips, trained.scores
         baselines = dict(trained.baselines) if config.baselines is None else baselines
         estimators = dict(trained.baseline_estimators) | estimators
@@ -73,7 +73,7 @@ def run_evaluation(
         )
     clips = changed(clips, config.clips, where="clips")
     epcs = clips.epcs if config.epcs is None else config.epcs
-    recordings += opened(config.recordings, config.virtual_tag)
+    recordings += open_recordings(config.recordings, config.virtual_tag)
     if not recordings:
         raise ConfigError(
             "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with held-out recordings."

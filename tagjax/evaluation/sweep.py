@@ -153,7 +153,7 @@ def _caching_loader(clips: ClipSettings) -> Callable[..., Any]:
     load_piece, held = clip_loader(clips), {}
 
     def load(recording: Any, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Any:
-        key = (recording.forwards is None, start, stop, None if epcs is None else tuple(epcs))
+        key = (recording.reversed_from is None, start, stop, None if epcs is None else tuple(epcs))
         if key not in held:
             held[key] = load_piece(recording, start, stop, epcs=epcs)
         return held[key]

@@ -1,6 +1,6 @@
-"""Building blocks of flow networks: convolutions in (height, width, channel) order, and changes of size.
+"""Building blocks of flow networks: convolutions in (height, width, channel) order, and resizing.
 
-XLA runs this order faster on CPUs than Equinox's own (channel, height, width).
+XLA runs this order faster on CPUs than Equinox's (channel, height, width).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 SLOPE = 0.1
-"""Of the leaky rectifier for negative values, as FlowNet and its successors have it."""
+"""Slope of the leaky rectifier for negative values, as in FlowNet and its successors."""
 
 
 class Conv(eqx.Module):
@@ -57,9 +57,9 @@ class Conv(eqx.Module):
 
 
 class SeparableConv(eqx.Module):
-    """A 3 x 3 convolution of each channel for itself, then a 1 x 1 of all (Xception, Chollet, CVPR 2017), with bias.
+    """A depthwise separable convolution, 3 x 3 then 1 x 1 (Xception, Chollet, CVPR 2017), with bias.
 
-    On CPUs the first is nine additions of moved pictures and the second a product of matrices, which uses every core:
+    On CPUs the depthwise part is nine additions of shifted images and the other a matrix product, which uses every core:
     with 32 channels a third of the time of `Conv`, with 64 an eighth.
     """
 
@@ -96,7 +96,7 @@ def rectify(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def space_to_depth(image: Float[Array, "height width channel"], factor: int) -> Float[Array, "rows columns deep"]:
-    """Squares of factor x factor pixels become the channels of one."""
+    """Squares of factor x factor pixels become the channels of one pixel."""
     height, width, channels = image.shape
     cells = image.reshape(height // factor, factor, width // factor, factor, channels)
     return cells.transpose(0, 2, 1, 3, 4).reshape(height // factor, width // factor, factor * factor * channels)
@@ -111,7 +111,7 @@ def shrink(image: Float[Array, "height width channel"], factor: int) -> Float[Ar
 def enlarge(image: Float[Array, "height width channel"], factor: int) -> Float[Array, "rows columns channel"]:
     """Bilinear, pixel centres kept: the inverse of `shrink` for linear images.
 
-    Moved copies, mixed: on CPUs a seventh of the time of `jax.image.resize`, which makes a product of matrices of it.
+    A weighted sum of shifted copies: on CPUs a seventh of the time of `jax.image.resize`, which uses matrix products.
     """
     return _enlarge_axis(_enlarge_axis(image, factor, 0), factor, 1)
 
@@ -122,7 +122,7 @@ def _enlarge_axis(image: Float[Array, "height width channel"], factor: int, axis
     before, here, after = (jax.lax.slice_in_dim(padded, n, n + length, axis=axis) for n in range(3))
     parts = []
     for n in range(factor):
-        # The fine pixel's centre, in coarse pixels from the middle of the one that it lies in.
+        # Offset of the fine pixel's centre from that of its coarse pixel, in coarse pixels.
         offset = (n + 0.5) / factor - 0.5
         parts.append((1 - abs(offset)) * here + abs(offset) * (before if offset < 0 else after))
     fine = jnp.stack(parts, axis=axis + 1)
@@ -144,16 +144,16 @@ def convex_upsample(
     height, width, _ = flow_px.shape
     cells = factor * factor
     padded = jnp.pad(factor * flow_px, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    # Sums of nine terms written out: XLA makes one loop of them, several times faster than a softmax and a product.
+    # Sums of nine terms, written out: XLA fuses them into one loop, several times faster than a softmax and a product.
     pieces = [logits[..., k * cells : (k + 1) * cells] for k in range(9)]
     largest = jax.lax.stop_gradient(functools.reduce(jnp.maximum, pieces))
-    # Without the barrier each of the three sums would compute the exponentials for itself.
-    shares = jax.lax.optimization_barrier([jnp.exp(piece - largest) for piece in pieces])
-    total = functools.reduce(jnp.add, shares)
+    # Without the barrier each of the three sums would compute the exponentials again.
+    mixing = jax.lax.optimization_barrier([jnp.exp(piece - largest) for piece in pieces])
+    total = functools.reduce(jnp.add, mixing)
 
     def mixed(axis: int) -> Array:
         around = [padded[i : i + height, j : j + width, axis : axis + 1] for i in range(3) for j in range(3)]
-        fine = functools.reduce(jnp.add, [share * value for share, value in zip(shares, around, strict=True)]) / total
+        fine = functools.reduce(jnp.add, [weight * value for weight, value in zip(mixing, around, strict=True)]) / total
         cut = fine.reshape(height, width, factor, factor).transpose(0, 2, 1, 3)
         return cut.reshape(height * factor, width * factor)
 

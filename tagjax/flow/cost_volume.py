@@ -1,4 +1,4 @@
-"""Cost volumes: how alike each pixel's feature is to those around it in the other picture."""
+"""Cost volumes: correlation of each pixel's feature with those around it in the other image."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _TILE = 16
-"""Columns whose products with their neighbourhood make one matrix product; best of 8, 16 and 32 on two CPU cores."""
+"""Columns per matrix product; fastest of 8, 16 and 32 on two CPU cores."""
 
 
 def normalise_features(
     first: Float[Array, "height width channel"], second: Float[Array, "height width channel"]
 ) -> tuple[Float[Array, "height width channel"], Float[Array, "height width channel"]]:
-    """Both maps less their common mean, over their common standard deviation (UFlow, Jonschkowski et al., 2020)."""
+    """Both maps minus their common mean, divided by their common standard deviation (UFlow, Jonschkowski et al., 2020)."""
     count = first.size + second.size
     mean = (jnp.sum(first) + jnp.sum(second)) / count
     first, second = first - mean, second - mean
@@ -43,7 +43,7 @@ def cost_volume(
     for dy in range(reach):
         right = strips[dy : dy + height].reshape(height * tiles, extent, channels)
         product = jnp.einsum("btc,bsc->bts", left, right).reshape(height * tiles, _TILE * extent)
-        # Rows one longer than the product's: element (t, t + j) comes to stand at (t, j).
+        # With rows longer by one, element (t, t + j) moves to (t, j).
         skewed = jnp.pad(product, ((0, 0), (0, _TILE))).reshape(height * tiles, _TILE, extent + 1)
         bands.append(skewed[:, :, :reach])
     volume = jnp.concatenate(bands, axis=-1).reshape(height, tiles * _TILE, reach * reach)

@@ -1,7 +1,7 @@
 """FlowNetS and FlowNetC (Dosovitskiy et al., ICCV 2015), the backbone of UnFlow and of TagAttention's flow.
 
-Ten convolutions down to 1/64 of the picture, four learned enlargements up to 1/4. Layer by layer the table of the
-published networks, every layer with a bias: 38.7 million parameters, and 39.2 million with the correlation.
+Ten convolutions down to 1/64 of the image, four learned enlargements up to 1/4. All layers are those of the
+published networks, each with a bias: 38.7 million parameters, and 39.2 million with the correlation.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .cost_volume import cost_volume
 from .network import AbstractFlowNetwork
 
 _UNIT_PX = 20.0
-"""Within the network flow counts in 20 pixels of the picture, whatever the level; what it gives out, in pixels."""
+"""Unit of the flow within the network, pixels of the image, at every level; the output is in pixels."""
 
 _CONTRACTING = (
     (64, 7, 2),  # conv1: channels, size, stride
@@ -34,18 +34,18 @@ _CONTRACTING = (
     (1024, 3, 1),  # conv6_1
 )
 _EXPANDING = (512, 256, 128, 64)
-_JOINED = 3
-"""Layers of FlowNetC that each picture goes through alone."""
+_NUM_SEPARATE = 3
+"""Number of first layers of FlowNetC that process each image separately."""
 
 _REDIRECTED = 32
 _REACH, _STEP = 20, 2
-"""Of FlowNetC's correlation: the largest displacement and the step between displacements, in cells of 8 pixels."""
+"""Largest displacement of FlowNetC's correlation and the step between displacements, in cells of 8 pixels."""
 
 
 class _Enlarge(eqx.Module):
     """Transposed convolution, 4 x 4, stride 2, padding 1, as four 2 x 2 convolutions, one for each output parity.
 
-    The same numbers as XLA's dilated form, whose weight gradient takes 7 s against 0.4 s over the four layers of
+    Equal to XLA's dilated form, whose weight gradient takes 7 s instead of 0.4 s over the four layers of
     FlowNet at 512 x 384 on two CPU cores.
     """
 
@@ -81,27 +81,27 @@ class _Enlarge(eqx.Module):
 
 
 class _Expanding(eqx.Module):
-    """The refinement: at each level a flow from all that is known there, enlarged together with the features."""
+    """The refinement: at each level a flow from all features there, enlarged together with the features."""
 
     features: tuple[_Enlarge, ...]
     flows: tuple[_Enlarge, ...]
     heads: tuple[Conv, ...]
 
     def __init__(self, coarsest: int, sides: Sequence[int], widths: Sequence[int], *, key: PRNGKeyArray):
-        """`sides` are the channels that join from the contracting part, coarse to fine."""
+        """`sides` are the channels of the skip connections from the contracting part, coarse to fine."""
         known = [coarsest, *(side + width + 2 for side, width in zip(sides, widths, strict=True))]
         keys = jax.random.split(key, 2 * len(known))
         self.features = tuple(
             _Enlarge(a, b, key=k) for a, b, k in zip(known[:-1], widths, keys[: len(widths)], strict=True)
         )
         self.flows = tuple(_Enlarge(2, 2, key=None) for _ in widths)
-        # Nearly zero: from scratch, the first estimate is no motion.
+        # Nearly zero, so that the first estimate of an untrained network is zero.
         self.heads = tuple(Conv(a, 2, gain=0.01, key=k) for a, k in zip(known, keys[-len(known) :], strict=True))
 
     def __call__(
         self, coarsest: Float[Array, "height width features"], sides: Sequence[Float[Array, ...]]
     ) -> tuple[Float[Array, "_ _ 2"], ...]:
-        """Flows in pixels of their own levels, from 1/64 to 1/4 of the picture, and the last at its full size."""
+        """Flows in pixels of their own levels, from 1/64 to 1/4 of the image, and the last at its full size."""
         x, flows = coarsest, [self.heads[0](coarsest)]
         for feature, flow, head, side in zip(self.features, self.flows, self.heads[1:], sides, strict=True):
             x = jnp.concatenate([side, rectify(feature(x)), flow(flows[-1])], axis=-1)
@@ -114,7 +114,7 @@ class _Expanding(eqx.Module):
 
 def _scaled(channels: int, width: float) -> int:
     if width <= 0:
-        raise ValueError(f"width is {width}; expected the share of the published channels to have, above 0.")
+        raise ValueError(f"width is {width}; expected the factor of the published channels, above 0.")
     return max(1, round(width * channels))
 
 
@@ -139,7 +139,7 @@ def strided_cost_volume(
 ) -> Float[Array, "height width displacement"]:
     """`cost_volume` at displacements that are multiples of `stride`, `radius` of them to each side.
 
-    Rows and columns a multiple of `stride` apart meet each other only: each such sub-grid is an ordinary cost volume.
+    Only rows and columns a multiple of `stride` apart are compared: each such sub-grid is an ordinary cost volume.
     """
     height, width, channels = first.shape
     spare = ((0, -height % stride), (0, -width % stride), (0, 0))
@@ -155,7 +155,7 @@ def strided_cost_volume(
 
 
 class FlowNetS(AbstractFlowNetwork):
-    """The simple network: both pictures stacked at the entrance. 38,676,514 parameters.
+    """The simple network: both images stacked as input. 38,676,514 parameters.
 
     `width` scales the channels (FlowNet 2.0 has thin variants of 3/8).
     """
@@ -179,7 +179,7 @@ class FlowNetS(AbstractFlowNetwork):
         self.divisor = 64
 
     def encode(self, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
-        """The picture less its mean colour: this network knows nothing of one picture alone."""
+        """The image minus its mean colour: this network has no features of a single image."""
         return _centred(image)
 
     def decode(
@@ -190,7 +190,7 @@ class FlowNetS(AbstractFlowNetwork):
 
 
 class FlowNetC(AbstractFlowNetwork):
-    """The network with a correlation of the two pictures' features at 1/8. 39,175,298 parameters.
+    """The network with a correlation of the two images' features at 1/8. 39,175,298 parameters.
 
     `width` scales the channels.
     """
@@ -207,13 +207,13 @@ class FlowNetC(AbstractFlowNetwork):
         redirected = _scaled(_REDIRECTED, width)
         costs = (2 * (_REACH // _STEP) + 1) ** 2
         entries = [3, *sizes[:-1]]
-        entries[_JOINED] = costs + redirected
+        entries[_NUM_SEPARATE] = costs + redirected
         layers = [
             Conv(inputs, outputs, size, stride=stride, key=key)
             for inputs, outputs, (_, size, stride), key in zip(entries, sizes, _CONTRACTING, keys, strict=False)
         ]
-        self.alone, self.contracting = tuple(layers[:_JOINED]), tuple(layers[_JOINED:])
-        self.redirect = Conv(sizes[_JOINED - 1], redirected, 1, key=keys[-2])
+        self.alone, self.contracting = tuple(layers[:_NUM_SEPARATE]), tuple(layers[_NUM_SEPARATE:])
+        self.redirect = Conv(sizes[_NUM_SEPARATE - 1], redirected, 1, key=keys[-2])
         self.expanding = _Expanding(
             sizes[9], [sizes[n] for n in (7, 5, 3, 1)], [_scaled(n, width) for n in _EXPANDING], key=keys[-1]
         )
@@ -222,7 +222,7 @@ class FlowNetC(AbstractFlowNetwork):
     def encode(
         self, image: Float[Array, "height width 3"]
     ) -> tuple[Float[Array, "quarter _ _"], Float[Array, "eighth _ _"]]:
-        """Features at 1/4 and at 1/8 of the picture, whose mean colour is taken out."""
+        """Features at 1/4 and at 1/8 of the image, without its mean colour."""
         _, side, joined = _contract(self.alone, _centred(image))
         return side, joined
 

@@ -1,4 +1,4 @@
-"""What every flow network offers: features of one picture, and flow from the features of two."""
+"""The interface of flow networks: features of one image, and flow from the features of two."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from jaxtyping import Array, Float
 
 
 class AbstractFlowNetwork(eqx.Module):
-    """A flow network in two parts, so that a video's pictures are encoded once and both directions share them.
+    """A flow network in two parts, so that each image of a video is encoded once for both directions.
 
-    Pictures are RGB, 0 to 1, with sides that are multiples of `divisor` (`tagjax.flow.estimates` takes any size).
+    Images are RGB, 0 to 1, with sides that are multiples of `divisor` (`tagjax.flow.estimates` takes any size).
     """
 
     divisor: eqx.AbstractVar[int]
 
     @abc.abstractmethod
     def encode(self, image: Float[Array, "height width 3"]) -> Any:
-        """Features of one picture."""
+        """Features of one image."""
 
     @abc.abstractmethod
     def decode(self, first: Any, second: Any) -> tuple[Float[Array, "_ _ 2"], ...]:
-        """Flow from the first picture to the second, on the first's pixels: rough to final.
+        """Flow from the first image to the second, on the first's pixels: estimates from coarse to final.
 
-        Each estimate is in pixels of its own resolution; the last one's is the pictures'.
+        Each estimate is in pixels of its own resolution; the last has the resolution of the images.
         """
 
 

@@ -8,12 +8,12 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from .pictures import as_bytes, check_pictures
+from .images import check_images, to_uint8
 
 FlowFunction: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(first, second), RGB uint8 (height, width, 3) each, to flow in pixels, float32 (height, width, 2) on `first`.
 
-Whatever else `check_pictures` takes is a picture, too.
+Other images that `check_images` accepts are converted.
 """
 
 DIS_PRESETS = {
@@ -22,12 +22,12 @@ DIS_PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 
-_SMALLEST = 16
-"""Pixels of a side below which pictures are enlarged by repeating the edge: OpenCV's DIS refuses fewer than 12."""
+_MIN_SIDE_PX = 16
+"""Shorter images are padded by their edge pixels: OpenCV's DIS refuses fewer than 12."""
 
 
 class DISFlow:
-    """Dense inverse search at one of OpenCV's presets: "ultrafast", "fast" or "medium"."""
+    """Dense inverse search at one of OpenCV's presets: "ultrafast", "fast" or "medium". Raises `ValueError` for others."""
 
     def __init__(self, preset: str = "medium"):
         if preset not in DIS_PRESETS:
@@ -60,22 +60,15 @@ FLOWS: dict[str, Callable[[], FlowFunction]] = {
 }
 
 
-def make_flow(name: str) -> FlowFunction:
-    """A flow of OpenCV by name; a name not in `FLOWS` raises `ValueError`."""
-    if name not in FLOWS:
-        raise ValueError(f"Unknown optical flow {name!r}; expected one of {', '.join(FLOWS)}.")
-    return FLOWS[name]()
-
-
-def to_gray(colour: np.ndarray) -> np.ndarray:
+def to_grey_uint8(colour: np.ndarray) -> np.ndarray:
     """RGB uint8 (height, width, 3) to grey uint8."""
     return cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
 
 
 def _grey_pair(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both pictures, checked, in grey, and large enough."""
-    one, other = (to_gray(np.ascontiguousarray(as_bytes(picture))) for picture in check_pictures(first, second))
-    rows, columns = (max(0, _SMALLEST - size) for size in one.shape)
+    """Both images, checked, in grey, padded to the minimum side."""
+    one, other = (to_grey_uint8(np.ascontiguousarray(to_uint8(picture))) for picture in check_images(first, second))
+    rows, columns = (max(0, _MIN_SIDE_PX - size) for size in one.shape)
     if rows or columns:
         one, other = (np.pad(picture, ((0, rows), (0, columns)), mode="edge") for picture in (one, other))
     return one, other

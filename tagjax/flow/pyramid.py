@@ -1,7 +1,7 @@
 """The default flow network: a small feature pyramid, a cost volume at each level, and learned upsampling.
 
 After PWC-Net (Sun et al., CVPR 2018) with UFlow's normalised cost volumes (Jonschkowski et al., ECCV 2020) and RAFT's
-convex upsampling (Teed and Deng, ECCV 2020), cut to what two CPU cores do at video rate.
+convex upsampling (Teed and Deng, ECCV 2020), reduced to the speed of two CPU cores at video rate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FINEST = 4
 _HIDDEN = 32
 _MEDIAN_PX = 5
 _CONVEX = 2
-"""The last step's learned upsampling; the rest is bilinear: by four at once would take as long as all the costs."""
+"""Factor of the learned upsampling in the last step; the remaining factor is bilinear, which is much faster."""
 
 
 _Layer = Conv | SeparableConv
@@ -32,7 +32,7 @@ _MakeLayer = Callable[..., _Layer]
 
 
 class _Decoder(eqx.Module):
-    """Correction of the flow at one level from the costs around the flow of the level above."""
+    """Correction of the flow at one level from the costs around the flow of the coarser level."""
 
     context: Conv
     layers: tuple[_Layer, ...]
@@ -47,7 +47,7 @@ class _Decoder(eqx.Module):
         sizes = [(2 * radius + 1) ** 2 + _HIDDEN + 2, *widths]
         self.context = Conv(features, _HIDDEN, 1, key=keys[-2])
         self.layers = tuple(layer(a, b, key=k) for a, b, k in zip(sizes[:-1], sizes[1:], keys[:-2], strict=True))
-        # Nearly zero: from scratch, the first estimate is no motion.
+        # Nearly zero, so that the first estimate of an untrained network is zero.
         self.head = layer(widths[-1], 2, gain=0.01, key=keys[-1])
         self.match = Conv(features, matched, 1, key=jax.random.fold_in(key, 0)) if matched else None
         self.radius = radius
@@ -70,21 +70,21 @@ class _Decoder(eqx.Module):
 
 
 class PyramidFlow(AbstractFlowNetwork):
-    """Levels at 1/4 to 1/32 of the picture, coarse to fine, then convex upsampling by four.
+    """Levels at 1/4 to 1/32 of the image, coarse to fine, then convex upsampling by four.
 
-    `widths` are the features of the levels, finest first, `radii` their search radii in pixels of the level,
-    `iterations` how often each corrects its flow with the same weights, around where the last correction led (None:
-    twice, but once at the finest and the roughest), and `decoder_widths` the hidden layers (the last is always 32).
+    `widths` are the numbers of features of the levels, finest first; `radii` their search radii in pixels of the level;
+    `iterations` the numbers of corrections with the same weights, each around the last flow (None: two, but one at the
+    finest and the coarsest level); `decoder_widths` the hidden layers (a last one of 32 is added).
 
-    `octaves` are the sizes of the picture, as powers of two, that the same weights are laid on in turn, each going on
-    from the flow of the one before: all levels on the smallest, the finest two where the picture is not enlarged, the
-    finest alone where it is. -1 reaches twice as far; each above 0 is twice as exact and takes four times as long.
+    `octaves` are the scales of the image, as powers of two, at which the same weights are applied in turn, each from the
+    flow of the one before: all levels at the smallest scale, the finest two up to scale 0, the finest only above. -1
+    doubles the search range; each octave above 0 doubles the resolution and takes four times as long.
 
-    `separable` splits every convolution of 3 x 3 in two (`SeparableConv`): a third to an eighth of the time each.
-    `matched` are the features of each level that costs are made of, mixed from all of them; 0, or None: all, as they are.
+    `separable` uses `SeparableConv` for every 3 x 3 convolution: a third to an eighth of the time. `matched` are the
+    numbers of features of each level that the costs are computed from, projected from all; 0 or None: all features.
 
-    `medians` is how often the flow is median filtered over 5 x 5 pixels in the end (Sun et al., CVPR 2010). Filtered
-    between the octaves, too, large motion would gain, and things of a few pixels lose.
+    `medians` is the number of final 5 x 5 median filters of the flow (Sun et al., CVPR 2010). Filters between the octaves
+    would improve large motion, but lose objects of a few pixels. Raises `ValueError` for impossible settings.
     """
 
     encoders: tuple[tuple[_Layer, _Layer], ...]
@@ -113,24 +113,24 @@ class PyramidFlow(AbstractFlowNetwork):
         lengths = [len(given) for given in (widths, radii, iterations, decoder_widths)]
         if len(set(lengths)) > 1 or not widths:
             raise ValueError(
-                "{} widths, {} radii, {} iterations, {} decoder_widths; one of each for every level.".format(*lengths)
+                "{} widths, {} radii, {} iterations, {} decoder_widths; expected one of each for every level.".format(
+                    *lengths
+                )
             )
         if min(iterations) < 1:
-            raise ValueError(f"iterations are {tuple(iterations)}; every level takes at least 1.")
+            raise ValueError(f"iterations are {tuple(iterations)}; expected at least 1 for every level.")
         if (
             not octaves
             or list(octaves) != list(range(octaves[0], octaves[-1] + 1))
             or not octaves[0] <= 0 <= octaves[-1]
         ):
-            raise ValueError(f"octaves are {tuple(octaves)}; expected neighbouring ones with 0 among them, rising.")
+            raise ValueError(f"octaves are {tuple(octaves)}; expected consecutive increasing integers that include 0.")
         if medians < 0:
-            raise ValueError(f"medians is {medians}; expected how often the flow is filtered, 0 for never.")
+            raise ValueError(f"medians is {medians}; expected the number of median filters, 0 or more.")
         count = len(widths)
         matched = [0] * count if matched is None else list(matched)
         if len(matched) != count or min(matched) < 0:
-            raise ValueError(
-                f"matched is {tuple(matched)}; expected one number of features for each of {count} levels."
-            )
+            raise ValueError(f"matched is {tuple(matched)}; expected a number of features for each of {count} levels.")
         layer = SeparableConv if separable else Conv
         keys = jax.random.split(jax.random.key(seed), 3 * count + 1)
         first = layer(3 * _FINEST**2, widths[0], key=keys[0])
@@ -149,14 +149,14 @@ class PyramidFlow(AbstractFlowNetwork):
         self.divisor = _FINEST * 2 ** (count - 1 - self.octaves[0])
 
     def encode(self, image: Float[Array, "height width 3"]) -> tuple[Levels, ...]:
-        """Features of every octave, finest level first; the picture's mean and contrast are taken out."""
+        """Features of every octave, finest level first; the image is normalised to zero mean and unit contrast."""
         return tuple(self._features(_sized(image, octave), self._levels(octave)) for octave in self.octaves)
 
     def decode(self, first: tuple[Levels, ...], second: tuple[Levels, ...]) -> Levels:
         flows: list[Array] = []
         finer = jnp.zeros((*first[0][0].shape[:2], 2))
         for one, other in zip(first, second, strict=True):
-            # The last octave's flow has the size of this one's finest level.
+            # The flow of the last octave has the size of this octave's finest level.
             flow = _sized_flow(finer, 1 - len(one))
             hidden = jnp.zeros((*flow.shape[:2], _HIDDEN))
             for level in reversed(range(len(one))):
@@ -172,7 +172,7 @@ class PyramidFlow(AbstractFlowNetwork):
         return (*flows, last)
 
     def _levels(self, octave: int) -> int:
-        """How many of the levels, finest first, are used on an octave."""
+        """Number of levels, finest first, that an octave uses."""
         if octave == self.octaves[0]:
             return len(self.encoders)
         return 1 if octave > 0 else min(2, len(self.encoders))

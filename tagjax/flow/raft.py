@@ -1,7 +1,7 @@
-"""RAFT, the small network (Teed and Deng, ECCV 2020): one update applied again and again, looking up all-pairs costs.
+"""RAFT, the small network (Teed and Deng, ECCV 2020): a recurrent update that looks up all-pairs costs.
 
-Flow is kept at 1/8 of the picture. Each update reads the costs around where the flow points, at four resolutions of
-the second picture, and a recurrent unit corrects the flow. One `lax.scan` for all updates keeps compilation short.
+Flow is at 1/8 of the image. Each update reads the costs around the flow's target, at four resolutions of the second
+image, and a recurrent unit corrects the flow. One `lax.scan` for all updates keeps compilation short.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _HIDDEN, _CONTEXT = 96, 64
 
 
 def _instance_norm(x: Array) -> Array:
-    """Each channel less its mean over the picture, over its standard deviation."""
+    """Each channel minus its mean over the image, divided by its standard deviation."""
     centred = x - jnp.mean(x, axis=(0, 1), keepdims=True)
     return centred * jax.lax.rsqrt(jnp.mean(centred * centred, axis=(0, 1), keepdims=True) + 1e-5)
 
@@ -56,7 +56,7 @@ class _Bottleneck(eqx.Module):
 
 
 class _Encoder(eqx.Module):
-    """Features at 1/8 of the picture: 7 x 7, six residual blocks of 32, 64 and 96 channels, 1 x 1."""
+    """Features at 1/8 of the image: 7 x 7, six residual blocks of 32, 64 and 96 channels, 1 x 1."""
 
     enter: Conv
     blocks: tuple[_Bottleneck, ...]
@@ -80,7 +80,7 @@ class _Encoder(eqx.Module):
 
 
 class _Update(eqx.Module):
-    """One correction of the flow: costs and flow become motion features, a gated unit remembers, a head corrects."""
+    """One update: motion features from costs and flow, a convolutional GRU, a head that predicts the correction."""
 
     cost: Conv
     flow_enter: Conv
@@ -101,7 +101,7 @@ class _Update(eqx.Module):
         self.gates = Conv(joined, 2 * _HIDDEN, key=keys[4])
         self.candidate = Conv(joined, _HIDDEN, key=keys[5])
         self.head_enter = Conv(_HIDDEN, 128, key=keys[6])
-        # Nearly zero, a dozen of them as well: from scratch, the first estimate is no motion.
+        # Nearly zero, also the sum of a dozen: the estimate of an untrained network is zero.
         self.head = Conv(128, 2, gain=0.001, key=keys[7])
 
     def __call__(
@@ -122,7 +122,7 @@ class _Update(eqx.Module):
 
 
 def halve(features: Float[Array, "height width channel"]) -> Float[Array, "rows columns channel"]:
-    """Mean of every two by two; an odd last row or column is left out, a side of one stays."""
+    """Mean of every two by two; an odd last row or column is left out; a side of one is kept."""
     height, width, channels = features.shape
     tall, wide = min(2, height), min(2, width)
     rows, columns = height // tall, width // wide
@@ -148,9 +148,9 @@ def _look_up(
     for row in (top, top + 1):
         for column in (left, left + 1):
             inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-            share = jnp.where(inside, (1 - jnp.abs(u - column)) * (1 - jnp.abs(v - row)), 0)
+            weight = jnp.where(inside, (1 - jnp.abs(u - column)) * (1 - jnp.abs(v - row)), 0)
             at = jnp.where(inside, row * columns + column, 0).astype(start.dtype) + start
-            total = total + share * jnp.take(volume.reshape(-1), at)
+            total = total + weight * jnp.take(volume.reshape(-1), at)
     return total
 
 
@@ -186,7 +186,7 @@ def look_up_products(
     y: Float[Array, " pixel"],
     radius: int,
 ) -> Float[Array, "pixel window window"]:
-    """`look_up` in the volume of all products first . second, which is never formed: memory grows with the pixels only.
+    """`look_up` in the volume of all products first . second, without computing it: memory is linear in the pixels.
 
     The gradient reaches the features only.
     """
@@ -214,10 +214,10 @@ def look_up_products(
 class RAFTSmall(AbstractFlowNetwork):
     """The paper's small network: 990,162 parameters at 4 levels and radius 3.
 
-    `updates` corrections, each with a flow at 1/8 of the picture, and the last enlarged bilinearly. `levels` and
-    `radius` say how far it looks: `radius` cells of 8 pixels at the finest of `levels` resolutions, twice as far at
-    each next. `all_pairs` keeps every product of two features in memory, (height width / 64)^2 floats and a third; without,
-    they are taken again at each update: for large pictures.
+    `updates` corrections, each with a flow at 1/8 of the image; the last is enlarged bilinearly. `levels` and `radius` set
+    the search range: `radius` cells of 8 pixels at the finest of `levels` resolutions, twice as far at each next.
+    `all_pairs` keeps every product of two features in memory, 4/3 (height width / 64)^2 floats; otherwise they are
+    computed at each update, for large images. Raises `ValueError` for impossible settings.
     """
 
     features: _Encoder
@@ -231,7 +231,7 @@ class RAFTSmall(AbstractFlowNetwork):
 
     def __init__(self, updates: int = 12, levels: int = 4, radius: int = 3, all_pairs: bool = True, *, seed: int = 0):
         if updates < 1 or levels < 1 or radius < 0:
-            raise ValueError(f"updates {updates}, levels {levels}, radius {radius}; at least 1, 1 and 0 are expected.")
+            raise ValueError(f"updates {updates}, levels {levels}, radius {radius}; expected at least 1, 1 and 0.")
         keys = jax.random.split(jax.random.key(seed), 3)
         self.features = _Encoder(_FEATURES, True, key=keys[0])
         self.context = _Encoder(_HIDDEN + _CONTEXT, False, key=keys[1])
@@ -242,7 +242,7 @@ class RAFTSmall(AbstractFlowNetwork):
     def encode(
         self, image: Float[Array, "height width 3"]
     ) -> tuple[Float[Array, "rows columns features"], Float[Array, "rows columns context"]]:
-        """Features to be compared, and what is remembered of the picture itself."""
+        """Features for the costs, and context features."""
         scaled = 2 * image - 1
         return self.features(scaled), self.context(scaled)
 
@@ -255,7 +255,7 @@ class RAFTSmall(AbstractFlowNetwork):
         rows, columns, channels = here.shape
         hidden, context = jnp.tanh(remembered[..., :_HIDDEN]), jax.nn.relu(remembered[..., _HIDDEN:])
         one = here.reshape(-1, channels) / math.sqrt(channels)
-        # Products with a mean are the mean of products: the coarser volumes need not be made of the finest.
+        # The products with a mean are the mean of the products: coarser volumes need no finest volume.
         others = [second[0]]
         for _ in range(self.levels - 1):
             others.append(halve(others[-1]))
@@ -274,7 +274,7 @@ class RAFTSmall(AbstractFlowNetwork):
 
         def step(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
             hidden, flow = carry
-            # As in the paper: an update answers for its own correction, not for where the ones before it looked.
+            # As in the paper: no gradient from an update to the flow of the updates before it.
             flow = jax.lax.stop_gradient(flow)
             hidden, correction = self.update(hidden, context, costs(flow), flow)
             return (hidden, flow + correction), flow + correction

@@ -1,7 +1,6 @@
-"""Weights of flow networks as plain arrays: one .npz file with the settings and the recipe that made them, as text.
+"""Weights of flow networks: safetensors files with the network's settings and the training recipe as metadata.
 
-Nothing in a file is executed: arrays are read as numbers, and the only class that its settings can name is a flow
-network of this package.
+Nothing in a file is executed. The only class that its settings can name is a flow network of this package.
 """
 
 from __future__ import annotations
@@ -16,13 +15,15 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 
-from ..core.arrays_file import ArraysFile, named_arrays
+from ..core.array_file import ArrayFile, named_arrays
 from .network import AbstractFlowNetwork
 
 PACKAGED = Path(__file__).parent / "weights"
-"""Where the weights that come with the package lie, as <name>.npz."""
+"""The folder of the weights that come with the package: <name>.safetensors."""
 
-_FILE = ArraysFile("tagjax-flow-weights", 1, "weights of a flow network", "python -m experiments.train_flow")
+SUFFIX = ".safetensors"
+
+_FILE = ArrayFile("tagjax-flow-weights", 1, "weights of a flow network", "python -m experiments.train_flow")
 _TARGET = re.compile(r"tagjax\.flow\.([a-z][a-z0-9_]*)\.([A-Z]\w*)")
 
 Network = TypeVar("Network", bound=AbstractFlowNetwork)
@@ -30,93 +31,95 @@ Network = TypeVar("Network", bound=AbstractFlowNetwork)
 
 def packaged_weights() -> tuple[str, ...]:
     """Names of the weights that come with the package."""
-    return tuple(sorted(path.stem for path in PACKAGED.glob("*.npz")))
+    return tuple(sorted(path.stem for path in PACKAGED.glob(f"*{SUFFIX}")))
 
 
 def find_weights(source: str | Path) -> Path:
-    """The file of packaged weights of that name, or at that path. Raises `ValueError` where there is none."""
-    packaged = PACKAGED / f"{source}.npz"
+    """The file of the packaged weights of that name, or the file at that path. Raises `ValueError` where there is none."""
+    packaged = PACKAGED / f"{source}{SUFFIX}"
     if str(source) in packaged_weights():
         return packaged
-    if str(source).endswith(".npz") and Path(source).is_file():
+    if str(source).endswith(SUFFIX) and Path(source).is_file():
         return Path(source)
-    there = ", ".join(packaged_weights()) or "none"
+    available = ", ".join(packaged_weights()) or "none"
     raise ValueError(
-        f"No weights at {str(source)!r}; expected the path of an .npz file, or the name of packaged weights ({there}). "
-        "`python -m experiments.train_flow` makes some."
+        f"No weights at {str(source)!r}; expected the path of a {SUFFIX} file, or the name of packaged weights "
+        f"({available}). `python -m experiments.train_flow` makes such files."
     )
 
 
 def save_weights(
-    path: str | Path, network: AbstractFlowNetwork, about: Mapping[str, Any], *, half: bool = False
+    path: str | Path, network: AbstractFlowNetwork, metadata: Mapping[str, Any], *, half: bool = False
 ) -> None:
-    """Write a network's arrays, named by their place in it, with `about` as JSON; in half precision if `half`.
+    """Write a network's arrays by name, with `metadata` as JSON; as float16 instead of float32 if `half`.
 
-    `about["flow"]` are the settings that build the network: `_target_` and arguments, as under conf/flow. The rest is
-    the writer's: recipe, seed, data, scores. The same content gives the same bytes. Raises `ValueError` for settings
-    that build another network.
+    `metadata["flow"]` are the settings that build the network: `_target_` and arguments, as under conf/flow. The other
+    entries are free: recipe, seed, data, scores. The same content gives the same bytes. Raises `ValueError` for settings
+    that build another network, and for values that are not finite.
     """
-    settings = about.get("flow")
+    settings = metadata.get("flow")
     if not isinstance(settings, Mapping):
-        raise ValueError(f"about holds {sorted(about)}; expected `flow`, the settings that build the network.")
-    told = _outline(settings, str(path))
-    if jax.tree.structure(told) != jax.tree.structure(network) or _shapes(told) != _shapes(network):
+        raise ValueError(f"metadata holds {sorted(metadata)}; expected `flow`, the settings that build the network.")
+    described = _abstract_network(settings, str(path))
+    if jax.tree.structure(described) != jax.tree.structure(network) or _shapes(described) != _shapes(network):
         raise ValueError(f"{path}: the settings {dict(settings)} build another network than the one to be saved.")
-    _FILE.write(path, network, about, half=half)
+    _FILE.write(path, network, metadata, half=half)
 
 
 def load_weights(network: Network, source: str | Path = "default") -> Network:
     """The network with the weights of a file, of packaged weights by name, or (`default`) of those packaged for it.
 
-    Raises `ValueError` for a file that is missing, damaged or foreign, and for one whose arrays do not fit.
+    Raises `ValueError` for a file that is missing, damaged or of another kind, and for one whose arrays do not fit.
     """
     if str(source) == "default":
         source = _packaged_for(network)
-    return _FILE.fill(network, find_weights(source))
+    return _FILE.read(find_weights(source), network)
 
 
 def load_network(source: str | Path, **changes: Any) -> AbstractFlowNetwork:
-    """The network that a file of weights describes, with these weights; errors as of `load_weights`.
+    """The network that the metadata of a weights file describe, with its weights; errors as of `load_weights`.
 
-    `changes` take the place of settings of the file that no weight depends on.
+    `changes` replace settings of the file; they must not change the shape of any weight.
     """
     path = find_weights(source)
-    return _FILE.fill(_outline({**weights_about(path)["flow"], **changes}, str(path)), path)
+    return _FILE.read(path, _abstract_network({**weights_metadata(path)["flow"], **changes}, str(path)))
 
 
-def weights_about(source: str | Path) -> dict[str, Any]:
-    """What a file of weights says of itself: `flow` (settings), recipe, seed, data, scores."""
+def weights_metadata(source: str | Path) -> dict[str, Any]:
+    """The metadata of a weights file: `flow` (settings of the network), recipe, seed, data, scores."""
     path = find_weights(source)
-    about = _FILE.about(path)
-    if not isinstance(about.get("flow"), dict):
-        raise ValueError(f"{path}: does not say which network it is of (`flow`).")
-    return about
+    metadata = _FILE.metadata(path)
+    if not isinstance(metadata.get("flow"), dict):
+        raise ValueError(f"{path}: the metadata have no settings of a network (`flow`). Train again.")
+    return metadata
 
 
 def _packaged_for(network: AbstractFlowNetwork) -> Path:
-    """The packaged weights of this class and these shapes; of this class at least."""
-    own = f"{type(network).__module__}.{type(network).__name__}"
-    of_class = [name for name in packaged_weights() if weights_about(name)["flow"].get("_target_") == own]
+    """The packaged weights of this class and these shapes, or else the first of this class."""
+    class_name = f"{type(network).__module__}.{type(network).__name__}"
+    of_class = [name for name in packaged_weights() if weights_metadata(name)["flow"].get("_target_") == class_name]
     for name in of_class:
-        if _shapes(_outline(weights_about(name)["flow"], name)) == _shapes(network):
-            return PACKAGED / f"{name}.npz"
+        if _shapes(_abstract_network(weights_metadata(name)["flow"], name)) == _shapes(network):
+            return PACKAGED / f"{name}{SUFFIX}"
     if of_class:
-        return PACKAGED / f"{of_class[0]}.npz"
-    there = ", ".join(packaged_weights()) or "none"
-    raise ValueError(f"No weights are packaged for {own} (there are: {there}). Train it, or give a file of weights.")
+        return PACKAGED / f"{of_class[0]}{SUFFIX}"
+    available = ", ".join(packaged_weights()) or "none"
+    raise ValueError(
+        f"No weights are packaged for {class_name} (packaged are: {available}). Train it, or give a file of weights."
+    )
 
 
 def _shapes(network: Any) -> dict[str, tuple[int, ...]]:
     return {name: tuple(leaf.shape) for name, leaf in named_arrays(network).items()}
 
 
-def _outline(settings: Mapping[str, Any], where: str) -> AbstractFlowNetwork:
-    """The network that settings build, with shapes in place of arrays: nothing of its size is allocated."""
+def _abstract_network(settings: Mapping[str, Any], where: str) -> AbstractFlowNetwork:
+    """The network that settings build, with shapes in place of arrays, so that no memory of its size is allocated."""
     target = settings.get("_target_")
-    named = _TARGET.fullmatch(target) if isinstance(target, str) else None
+    match = _TARGET.fullmatch(target) if isinstance(target, str) else None
     network = None
-    if named is not None and (Path(__file__).parent / f"{named[1]}.py").is_file():
-        network = getattr(importlib.import_module(f"tagjax.flow.{named[1]}"), named[2], None)
+    if match is not None and (Path(__file__).parent / f"{match[1]}.py").is_file():
+        network = getattr(importlib.import_module(f"tagjax.flow.{match[1]}"), match[2], None)
     if not inspect.isclass(network) or not issubclass(network, AbstractFlowNetwork) or inspect.isabstract(network):
         raise ValueError(f"{where}: the settings name {target!r}; expected a network of tagjax.flow.")
     arguments = {str(key): value for key, value in settings.items() if key != "_target_"}

@@ -1,1 +1,1 @@
-"""Image operations: warps."""
+"""Image operations: warps, census transform, median filter, edge-preserving smoothing."""

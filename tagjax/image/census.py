@@ -1,4 +1,4 @@
-"""Soft ternary census transform and its distance: what two pictures share whatever the light.
+"""Soft ternary census transform and its distance: a comparison of images that is invariant to brightness.
 
 After Meister et al. (UnFlow, AAAI 2018, Eq. 4-5) with the constants of its published code.
 """
@@ -16,7 +16,7 @@ Offset = tuple[int, int]
 """(rows down, columns right) from a pixel to the neighbour that it is compared with."""
 
 _SOFTNESS = 0.81
-"""Squared difference, in grey levels of 255, at which the sign of a comparison counts about 0.7."""
+"""Squared difference, in grey levels of 255, at which the soft sign is about 0.7."""
 
 _DISTANCE = 0.1
 
@@ -25,17 +25,18 @@ GREY = np.asarray([0.299, 0.587, 0.114], np.float32)
 
 
 def to_grey(image: Float[Array, "height width 3"]) -> Float[Array, "height width"]:
-    """Luma of an RGB picture."""
+    """Luma of an RGB image."""
     return jnp.sum(image * jnp.asarray(GREY, image.dtype).reshape(1, 1, 3), axis=-1)
 
 
 def census_offsets(radius: int, stride: int = 1) -> tuple[Offset, ...]:
     """Offsets to half of the neighbours within a square of (2 radius + 1)^2 pixels, every `stride`-th of them.
 
-    The other half says the same: comparing a with b is comparing b with a, one pixel on.
+    The other half is redundant: comparing a with b is comparing b with a at another pixel. Raises `ValueError` for a radius
+    or stride below 1.
     """
     if radius < 1 or stride < 1:
-        raise ValueError(f"A census of radius {radius}, every {stride}-th neighbour; both must be at least 1.")
+        raise ValueError(f"The census has radius {radius} and stride {stride}; expected at least 1 for both.")
     reach = range(-radius, radius + 1)
     half = [(dy, dx) for dy in reach for dx in reach if (dy, dx) > (0, 0)]
     return tuple(half[::stride])
@@ -44,7 +45,7 @@ def census_offsets(radius: int, stride: int = 1) -> tuple[Offset, ...]:
 def ternary(grey: Float[Array, "height width"], offsets: Sequence[Offset]) -> Float[Array, "offset height width"]:
     """Soft sign of each neighbour's difference: d / sqrt(0.81 + d^2), d in levels of 255. `grey` is 0 to 1.
 
-    Neighbours beyond the border count as the border's pixel.
+    Beyond the image, border pixels are repeated.
     """
     height, width = grey.shape
     reach = max(max(abs(dy), abs(dx)) for dy, dx in offsets)
@@ -62,7 +63,7 @@ def ternary(grey: Float[Array, "height width"], offsets: Sequence[Offset]) -> Fl
 def census_distance(
     first: Float[Array, "height width"], second: Float[Array, "height width"], offsets: Sequence[Offset]
 ) -> Float[Array, "height width"]:
-    """Mean over the neighbours of d^2 / (0.1 + d^2), d the difference of the two soft signs: 0 to 1, alike to unlike."""
+    """Mean over the neighbours of d^2 / (0.1 + d^2), d the difference of the soft signs: 0 (equal) to 1."""
     difference = ternary(first, offsets) - ternary(second, offsets)
     squared = difference * difference
     return jnp.mean(squared / (_DISTANCE + squared), axis=0)

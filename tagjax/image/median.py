@@ -1,4 +1,4 @@
-"""Median filter: what most neighbours say, so that single wrong pixels go and edges stay."""
+"""Median filter, which removes single outliers and preserves edges."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from jaxtyping import Array, Float
 
 
 def median_filter(image: Float[Array, "height width channel"], size: int) -> Float[Array, "height width channel"]:
-    """Median of each channel over size x size pixels, the picture's edge pixels repeated beyond it.
+    """Median of each channel over size x size pixels; beyond the image its edge pixels are repeated.
 
-    As `scipy.ndimage.median_filter(mode="nearest")`, made of minima and maxima of whole pictures: XLA makes one loop of
-    them, where a sort of every pixel's neighbours would take twenty times as long. The gradient goes to the pixel that the
-    median is. Raises `ValueError` for an even or negative size.
+    As `scipy.ndimage.median_filter(mode="nearest")`, made of minima and maxima of whole images: XLA fuses them into
+    one loop, while sorting every pixel's neighbours takes twenty times as long. The gradient goes to the median pixel. Raises `ValueError` for an even or negative size.
     """
     if size < 1 or size % 2 == 0:
         raise ValueError(f"size is {size}; expected an odd number of pixels.")
@@ -28,9 +27,9 @@ def median_filter(image: Float[Array, "height width channel"], size: int) -> Flo
 
 @functools.cache
 def _comparisons(count: int, wanted: int) -> tuple[tuple[int, int], ...]:
-    """Pairs of places to put in order, one after the other, until place `wanted` holds what sorting would put there.
+    """Compare-exchange pairs of a sorting network, in order, after which element `wanted` has its sorted value.
 
-    Batcher's odd-even merge sort (AFIPS 1968) less what the wanted place does not depend on.
+    Batcher's odd-even merge sort (AFIPS 1968) without the comparisons that this element does not depend on.
     """
     kept, needed = [], {wanted}
     for pair in reversed(_merge_sort(count)):

@@ -1,4 +1,4 @@
-"""Warps by optical flow: bilinear gather, and differentiable forward splat that marks its holes."""
+"""Warps by optical flow: bilinear gather (backward), and differentiable splat (forward) with a mask of its holes."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def _taps(
         for dx in (0.0, 1.0):
             column, row = x0 + dx, y0 + dy
             inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
-            share = (1.0 - jnp.abs(x - column)) * (1.0 - jnp.abs(y - row))
+            bilinear = (1.0 - jnp.abs(x - column)) * (1.0 - jnp.abs(y - row))
             flat = jnp.clip(row, 0, height - 1) * width + jnp.clip(column, 0, width - 1)
             index.append(flat.astype(jnp.int32))
-            weight.append(jnp.where(inside, share, 0.0))
+            weight.append(jnp.where(inside, bilinear, 0.0))
     return jnp.stack(index), jnp.stack(weight)
 
 
@@ -41,9 +41,9 @@ Taps = tuple[tuple[Float[Array, "height width channel"], Float[Array, "height wi
 
 
 def gather_taps(image: Float[Array, "height width channel"], flow_px: Float[Array, "height width 2"]) -> Taps:
-    """The four values around `pixel + flow`, each with its bilinear weight (0 outside), for a caller's own mixture.
+    """The four values around `pixel + flow`, each with its bilinear weight (0 outside), for the caller to combine.
 
-    Four maps and not one stack: XLA then reads and mixes them in one loop, several times as fast.
+    Four maps instead of one stack: XLA then reads and combines them in one loop, several times as fast.
     """
     height, width, channels = image.shape
     x, y = pixel_grid(height, width, flow_px.dtype)
@@ -56,10 +56,10 @@ def gather_taps(image: Float[Array, "height width channel"], flow_px: Float[Arra
     for down in (0, 1):
         for right in (0, 1):
             column, row = left + right, top + down
-            share = (x - left if right else 1 - (x - left)) * (y - top if down else 1 - (y - top))
+            bilinear = (x - left if right else 1 - (x - left)) * (y - top if down else 1 - (y - top))
             inside = near & (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
             value = bordered.at[corner + down * (width + 2) + right].get(mode="clip")
-            taps.append((value, jnp.where(inside, share, 0.0)))
+            taps.append((value, jnp.where(inside, bilinear, 0.0)))
     return tuple(taps)
 
 
@@ -70,7 +70,7 @@ def gather(
 ) -> tuple[Float[Array, "height width channel"], Bool[Array, "height width"]]:
     """Backward warp: sample `image` at `pixel + flow`, bilinearly, over valid pixels only.
 
-    Returns the samples and where they rest on valid pixels by at least half of their weight; 0 elsewhere.
+    Returns the samples and a mask: where valid pixels have at least half of the bilinear weight; 0 elsewhere.
     """
     taps = gather_taps(image, flow_px)
     if valid is not None:
@@ -87,11 +87,11 @@ def splat(
     flow_px: Float[Array, "height width 2"],
     importance: Float[Array, "height width"] | None = None,
 ) -> tuple[Float[Array, "height width channel"], Bool[Array, "height width"]]:
-    """Forward warp: move every pixel by its flow and spread it bilinearly over the four pixels it lands on.
+    """Forward warp: move every pixel by its flow and distribute it bilinearly over the four pixels around its target.
 
-    Where several land, they are averaged by bilinear weight times `importance` (all 1 if None; use
-    exp(-depth / scale) to let the nearer win, 0 to leave a pixel out: softmax splatting). Returns the image and where
-    anything landed; holes are 0 and False. Differentiable in image, flow and importance.
+    Where several pixels meet, they are averaged by bilinear weight times `importance` (all 1 if None; use
+    exp(-depth / scale) to favour the nearer, 0 to leave a pixel out: softmax splatting). Returns the image and the mask of
+    pixels that received a value; holes are 0 and False. Differentiable in image, flow and importance.
     """
     height, width, channels = image.shape
     x, y = pixel_grid(height, width, flow_px.dtype)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from ..flow.pictures import as_unit
+from ..flow.images import to_float
 from .tracking import MaskedMean
 
 OUTLIERS_PX = (1, 3, 5)
@@ -53,8 +53,8 @@ def warped_error(
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     u, v = x + flow_px[..., 0].astype(np.float32), y + flow_px[..., 1].astype(np.float32)
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
-    moved = cv2.remap(as_unit(second), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(np.mean(np.abs(255.0 * (as_unit(first) - moved)), axis=-1, dtype=np.float64)), inside
+    moved = cv2.remap(to_float(second), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(np.mean(np.abs(255.0 * (to_float(first) - moved)), axis=-1, dtype=np.float64)), inside
 
 
 @dataclasses.dataclass(frozen=True)

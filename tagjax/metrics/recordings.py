@@ -59,7 +59,7 @@ class Picture:
     masks: Bool[np.ndarray, "tag height width"]
     boxes_px: Float[np.ndarray, "tag 4"]
     confidence: Float[np.ndarray, " tag"]
-    found: Bool[np.ndarray, " tag"]
+    detected: Bool[np.ndarray, " tag"]
 
 
 @dataclasses.dataclass(frozen=True)

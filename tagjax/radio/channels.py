@@ -1,4 +1,4 @@
-"""Phase offsets of hopping channels: affine in frequency, with a slope that is the device's."""
+"""Phase offsets of hopping channels: affine in frequency, with a slope specific to the reader."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 
 MAX_SLOPE_RAD_HZ = 1.0e-6
-"""Slopes are searched up to 1 rad/MHz either way; 0.3 to 0.43 rad/MHz were measured (cable and group delay)."""
+"""Largest slope of the search, either sign; 0.3 to 0.43 rad/MHz were measured (cable and group delay)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ChannelSlope:
-    """Offsets are slope * (f - f0) + a residual of standard deviation `residual_rad` at a hop."""
+    """Offsets are slope * (f - f0) + a residual of standard deviation `residual_rad` per hop; pi if the slope is unknown."""
 
     slope_rad_hz: float
     residual_rad: float
@@ -29,10 +29,10 @@ def estimate_slope(
     max_gap_s: float = 0.15,
     min_coherence: float = 0.3,
 ) -> ChannelSlope:
-    """The slope that best explains the phase jumps at channel changes, with motion taken out by in-channel steps.
+    """The slope that best explains the phase jumps at channel changes, corrected for motion by steps within channels.
 
-    Doubled angles, so pi flips do no harm. Where the jumps do not agree on a slope (coherence below `min_coherence`),
-    or there are fewer than 4 hops, the offset after a hop counts as unknown: residual pi.
+    Angles are doubled, so pi flips have no effect. If the jumps do not agree on a slope (coherence below
+    `min_coherence`), or there are fewer than 4 hops, the offset after a hop is unknown: residual pi.
     """
     unknown = ChannelSlope(0.0, float(np.pi), 0.0, 0)
     if len(time_s) < 8:
@@ -54,7 +54,7 @@ def estimate_slope(
     if len(jump) < 4:
         return dataclasses.replace(unknown, num_hops=len(jump))
     jumps, changes = np.asarray(jump), np.asarray(change)
-    # Doubled phases make slopes ambiguous by pi over the channel raster; the smallest best one is taken.
+    # Doubled phases make slopes ambiguous by pi over the channel raster; the smallest of the best is used.
     slopes = np.linspace(-MAX_SLOPE_RAD_HZ, MAX_SLOPE_RAD_HZ, 4001)
     signed = np.mean(np.cos(2 * (jumps[None, :] - slopes[:, None] * changes[None, :])), axis=1)
     near_best = signed >= signed.max() - 1e-3

@@ -1,4 +1,4 @@
-"""How well a distance over time explains raw phase reads, without any unwrapping: coherence, and likelihood."""
+"""Agreement of a distance over time with raw phase reads, without unwrapping: coherence and likelihood."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def phase_residual(
     carrier_hz: Float[Array, "*#batch reads"],
     distance_m: Float[Array, "*batch reads"],
 ) -> Float[Array, "*batch reads"]:
-    """phi - 4 pi f d / c: constant within a channel if the distance is right up to a constant."""
+    """phi - 4 pi f d / c, radians: constant within a channel if the distance is correct up to a constant."""
     return phase_rad - (4 * jnp.pi / SPEED_OF_LIGHT_M_S) * carrier_hz * distance_m
 
 
@@ -29,7 +29,7 @@ def coherence(
     """sum_c |sum_{r in c} w_r exp(j m residual_r)| / sum_r w_r, in [0, 1]; 0 without reads.
 
     Generalises TagVision's coherent matching score to hopping reads: the unknown phase offset of each channel c is
-    profiled out by the magnitude. `multiple` m = 2 takes the doubled angle, which pi flips leave alone.
+    profiled out by the magnitude. `multiple` m = 2 uses the doubled angle, which pi flips do not change.
     """
     angle = multiple * residual_rad
     member = jax.nn.one_hot(channel, num_channels, dtype=residual_rad.dtype) * weight[..., None]
@@ -47,19 +47,22 @@ def phase_likelihood(
     channel: Int[Array, "*#batch reads"],
     *,
     num_channels: int,
-    flip_share: float,
+    flip_probability: float,
     num_iterations: int = 3,
 ) -> Float[Array, "*batch"]:
-    """Log likelihood ratio of reads to phases at random, offsets profiled out and pi flips marginalised, in nats.
+    """Log likelihood ratio of the reads to uniform phases, offsets profiled out and pi flips marginalised, in nats.
 
-    sum_c max_o sum_{r in c} log [(1 - q) exp(k_r cos(e_r - o)) + q exp(-k_r cos(e_r - o))] / I0(k_r): von Mises noise of concentration k_r (0 for what is no read), flips of probability q = `flip_share` in
-    (0, 1), each channel's offset o the most likely one. The doubled angle gives it modulo pi, and expectation-maximisation
-    of the flips from both ends refines it. It carries no gradient, since the likelihood is stationary there. Without reads 0.
+    sum_c max_o sum_{r in c} log [(1 - q) exp(k_r cos(e_r - o)) + q exp(-k_r cos(e_r - o))] / I0(k_r)
+
+    with von Mises noise of concentration k_r (0 for an invalid read), flips of probability q = `flip_probability` in
+    (0, 1), and the most likely offset o of each channel. The doubled angle gives the offset modulo pi, and
+    expectation-maximisation of the flips from both solutions refines it. The offset carries no gradient, since the
+    likelihood is stationary there. 0 without reads.
     """
     residual_rad, concentration, channel = jnp.broadcast_arrays(residual_rad, concentration, channel)
     member = jax.nn.one_hot(channel, num_channels, dtype=residual_rad.dtype)
     fixed = jax.lax.stop_gradient(residual_rad)
-    log_odds = jnp.log1p(-flip_share) - jnp.log(flip_share)
+    log_odds = jnp.log1p(-flip_probability) - jnp.log(flip_probability)
 
     def of_channels(values: Float[Array, "*batch reads"]) -> Float[Array, "*batch channels"]:
         return jnp.einsum("...r,...rc->...c", values, member)
@@ -76,7 +79,7 @@ def phase_likelihood(
             towards = concentration * jnp.cos(fixed - of_reads(offset))
             offset = direction(concentration * jnp.tanh(towards + 0.5 * log_odds), 1.0)
         towards = concentration * jnp.cos(residual_rad - of_reads(jax.lax.stop_gradient(offset)))
-        either = jnp.logaddexp(towards + jnp.log1p(-flip_share), jnp.log(flip_share) - towards)
+        either = jnp.logaddexp(towards + jnp.log1p(-flip_probability), jnp.log(flip_probability) - towards)
         return of_channels(either - log_i0(concentration))
 
     half = direction(concentration, 2.0)

@@ -11,10 +11,10 @@ from ..core.numerics import SPEED_OF_LIGHT_M_S
 def distance_to_phase(
     distance_m: Float[Array, "*batch"], carrier_hz: Float[Array, "*#batch"]
 ) -> Float[Array, "*batch"]:
-    """Unwrapped phase 4 pi f L / c of a tag at distance L (there and back), radians."""
+    """Unwrapped phase 4 pi f L / c of a tag at distance L (round trip 2 L), radians."""
     return (4 * jnp.pi / SPEED_OF_LIGHT_M_S) * carrier_hz * distance_m
 
 
 def phase_to_distance(phase_rad: Float[Array, "*batch"], carrier_hz: Float[Array, "*#batch"]) -> Float[Array, "*batch"]:
-    """Distance L = phi c / (4 pi f) (Eq. 1) that an unwrapped phase (difference) stands for, metres."""
+    """Distance L = phi c / (4 pi f) (Eq. 1) of an unwrapped phase (difference), metres."""
     return phase_rad * SPEED_OF_LIGHT_M_S / (4 * jnp.pi * carrier_hz)

@@ -1,4 +1,4 @@
-"""A UHF RFID reader: which tag is read when, on which channel, and what phase and RSSI it reports.
+"""Model of a UHF RFID reader: read times, channel hopping, reported phase and RSSI.
 
 Constants were measured on public logs of Impinj R420 readers (rail: an antenna on a rail, China, 8 channels;
 counted: 1 to 25 tags, Taiwan; hopping: FCC, 50 channels).
@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 
 ROUND_BASE_S = 17.3e-3
-"""Inventory round of no tag (counted): a round of N tags lasts ROUND_BASE_S + N * ROUND_PER_TAG_S, rms error 2 ms."""
+"""Inventory round without tags (counted): a round of N tags takes ROUND_BASE_S + N * ROUND_PER_TAG_S, rms error 2 ms."""
 
 ROUND_PER_TAG_S = 4.23e-3
 """Time that each further tag adds to a round (counted)."""
@@ -30,23 +30,23 @@ RSSI_STEP_DB = 0.5
 """Resolution of the reported RSSI."""
 
 SENSITIVITY_DBM = -77.5
-"""Weakest read in the logs."""
+"""Lowest RSSI in the logs."""
 
 NOISE_SLOPE_PER_DBM = -0.0374
 NOISE_INTERCEPT = -3.56
 """log10(phase noise / rad) = slope * RSSI + intercept (rail)."""
 
 NOISE_FLOOR_RAD = (0.012, 0.02)
-"""Noise that a strong signal keeps; it differs between recordings."""
+"""Noise floor at a high RSSI, range over recordings."""
 
 SLOPE_RAD_HZ = (0.30e-6, 0.43e-6)
 """Size of the affine phase offset over channels, either sign: cable and group delay (rail +0.42, counted -0.31)."""
 
 CHANNEL_EPSILON_RAD = 0.005
-"""What the affine offset leaves (rail: 0.003 to 0.006 rad)."""
+"""Standard deviation of the offsets about the affine model (rail: 0.003 to 0.006 rad)."""
 
 RSSI_AT_1M_DBM = -45.0
-"""Typical of the logs at 0.9 to 1 m."""
+"""RSSI at 1 m, typical of the logs at 0.9 to 1 m."""
 
 RSSI_PER_DECADE_DB = 21.0
 """Measured fall with distance (hopping, 0.3 to 2.1 m); free space would give 40."""
@@ -64,27 +64,30 @@ HOP_TABLES_HZ: dict[str, tuple[float, ...]] = {
     "etsi": (865.7e6, 866.3e6, 866.9e6, 867.5e6),
     "fixed": (920.625e6,),
 }
-"""Channels by region; a reader visits them in an order of its own."""
+"""Channels by region; each reader visits them in its own order."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ReaderSettings:
-    """What differs between readers and set-ups. `num_tags` sets the round time: 1 gives 46 reads/s, 12 give 15."""
+    """Settings of a reader. `num_tags` sets the round time: 1 tag gives 46 reads/s, 12 tags give 15.
+
+    Raises `ValueError` for an unknown region and values that are not possible.
+    """
 
     region: str = "china"
     num_tags: int = 1
     flip_probability: float = 0.05
     multipath_rad: float = 0.1  # slow ripple of the phase along the path: the rail shows 0.13 to 0.23 rad
     dwell_s: float = DWELL_S
-    dropout: float = 0.03  # share of the rounds in which a tag is not heard
+    dropout: float = 0.03  # probability that a tag is not read in a round
 
     def __post_init__(self):
         if self.region not in HOP_TABLES_HZ:
             raise ValueError(f"Unknown region {self.region!r}; expected one of {', '.join(HOP_TABLES_HZ)}.")
         if self.num_tags < 1:
-            raise ValueError(f"num_tags is {self.num_tags}; at least 1 tag must be there.")
+            raise ValueError(f"num_tags is {self.num_tags}; expected at least 1.")
         if not 0 <= self.flip_probability <= 0.5:
-            raise ValueError(f"flip_probability is {self.flip_probability}; expected a share between 0 and 0.5.")
+            raise ValueError(f"flip_probability is {self.flip_probability}; expected a probability from 0 to 0.5.")
 
     @property
     def round_s(self) -> float:
@@ -94,7 +97,7 @@ class ReaderSettings:
 
 @dataclasses.dataclass(frozen=True)
 class ReaderState:
-    """What one reader keeps over a recording: order of channels, phase offsets, noise floor."""
+    """Constants of one reader over a recording: order of channels, phase offsets, noise floor, phase of the hopping."""
 
     hop_table_hz: np.ndarray
     offset_rad: np.ndarray  # of each entry of the hop table
@@ -103,7 +106,7 @@ class ReaderState:
 
     @classmethod
     def draw(cls, settings: ReaderSettings, rng: np.random.Generator) -> ReaderState:
-        """Draw a reader; several tags of a recording share one."""
+        """Draw a reader at random; all tags of a recording have the same reader."""
         table = rng.permutation(np.asarray(HOP_TABLES_HZ[settings.region]))
         slope = rng.choice([-1.0, 1.0]) * rng.uniform(*SLOPE_RAD_HZ)
         offset = slope * (table - table.mean()) + rng.normal(0, CHANNEL_EPSILON_RAD, len(table))
@@ -116,8 +119,8 @@ def read_times(start_s: float, stop_s: float, settings: ReaderSettings, rng: np.
     shape = 1.0 / ROUND_JITTER**2
     gaps = rng.gamma(shape, settings.round_s / shape, count)
     times = start_s + rng.uniform(0, settings.round_s) + np.cumsum(gaps)
-    heard = rng.random(count) >= settings.dropout
-    return times[heard & (times < stop_s)]
+    received = rng.random(count) >= settings.dropout
+    return times[received & (times < stop_s)]
 
 
 def channel_at(time_s: np.ndarray, state: ReaderState, settings: ReaderSettings) -> np.ndarray:
@@ -126,13 +129,13 @@ def channel_at(time_s: np.ndarray, state: ReaderState, settings: ReaderSettings)
 
 
 def rssi_at(range_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """RSSI of a tag along its path, dBm, before quantisation: fall with distance and a slow multipath ripple."""
+    """RSSI of a tag along its path, dBm, before quantisation: decrease with distance and a slow multipath ripple."""
     ripple = RSSI_RIPPLE_DB * np.sqrt(2) * np.sin(range_m * rng.uniform(4, 12) + rng.uniform(0, 2 * np.pi))
     return RSSI_AT_1M_DBM - RSSI_PER_DECADE_DB * np.log10(np.maximum(range_m, 0.1)) + ripple
 
 
 def noise_sigma_rad(rssi_dbm: np.ndarray, floor_rad: float) -> np.ndarray:
-    """Phase noise at an RSSI: the measured line, above the recording's floor."""
+    """Standard deviation of the phase at each RSSI (dBm), radians: the measured line and the recording's floor."""
     return np.hypot(floor_rad, 10.0 ** (NOISE_SLOPE_PER_DBM * rssi_dbm + NOISE_INTERCEPT))
 
 

@@ -15,11 +15,11 @@ else:
 
 
 class PhaseReads(eqx.Module):
-    """Reads of one tag in a buffer of fixed length; only elements with `valid` count.
+    """Reads of one tag in a buffer of fixed length; only elements with `valid` are used.
 
-    Phases grow with distance (a reader's opposite sign is turned at the door) and lie in [0, 2 pi). `channel` numbers
-    the distinct (antenna, carrier) pairs from 0: phase offsets are constant within a channel only. NumPy arrays are
-    reads that have not been to a device yet; compiled functions take them.
+    Phases grow with distance (the opposite sign of a reader is converted on import into the buffer) and are in [0, 2 pi).
+    `channel` numbers the distinct (antenna, carrier) pairs from 0: phase offsets are constant within a channel only.
+    Arrays may be NumPy arrays, for reads that are still on the host; compiled functions take both.
     """
 
     time_s: Float[_HostOrDevice, "*batch reads"]  # from the recording's first frame
@@ -31,10 +31,10 @@ class PhaseReads(eqx.Module):
 
 
 class RadioWindow(eqx.Module):
-    """What the radio knows of a tag's distance at the frames of a sliding window, oldest first.
+    """A tag's distance, estimated from reads, at the frames of a sliding window, oldest first.
 
     Distances are relative to the first frame of the window (so the first is 0); `std_m` is the standard deviation of
-    each against that first one, infinite where nothing is known (no reads yet, or a gap).
+    each difference, infinite where it is unknown (no reads yet, or a gap).
     """
 
     relative_m: Float[Array, "*batch window"]

@@ -1,4 +1,4 @@
-"""Least-squares refinement of a tag's path at given times, with implicit gradients and standard deviations."""
+"""Least-squares refinement of a tag's distance at given times, with implicit gradients and covariance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..core.numerics import SPEED_OF_LIGHT_M_S, wrap_to_pi
-from .grid_filter import RadioModel, level_phase
+from .bayes_filter import RadioModel, remove_channel_slope
 from .reads import PhaseReads
 
 _OFFSET_STD_RAD = 10.0
@@ -17,7 +17,7 @@ _WALK_STD_M = 10.0
 
 
 class RefinedPath(eqx.Module):
-    """Path at the knots relative to the first knot, with its covariance, metres and square metres."""
+    """Distance at the knots relative to the first knot, metres, with its covariance, square metres."""
 
     relative_m: Float[Array, " knots"]
     covariance_m2: Float[Array, "knots knots"]
@@ -26,13 +26,13 @@ class RefinedPath(eqx.Module):
 def interpolation_weights(
     query_s: Float[Array, " query"], knot_s: Float[Array, " knots"]
 ) -> Float[Array, "query knots"]:
-    """Weights of linear interpolation between knots in order of time; a query outside takes the end knot."""
+    """Weights of linear interpolation between knots in order of time; outside, the end knot is repeated."""
     upper = jnp.clip(jnp.searchsorted(knot_s, query_s), 1, knot_s.shape[0] - 1)
     span = knot_s[upper] - knot_s[upper - 1]
-    share = jnp.clip((query_s - knot_s[upper - 1]) / jnp.where(span > 0, span, 1.0), 0.0, 1.0)
+    fraction = jnp.clip((query_s - knot_s[upper - 1]) / jnp.where(span > 0, span, 1.0), 0.0, 1.0)
     one_hot = jax.nn.one_hot
     size = knot_s.shape[0]
-    return (1.0 - share)[:, None] * one_hot(upper - 1, size, dtype=query_s.dtype) + share[:, None] * one_hot(
+    return (1.0 - fraction)[:, None] * one_hot(upper - 1, size, dtype=query_s.dtype) + fraction[:, None] * one_hot(
         upper, size, dtype=query_s.dtype
     )
 
@@ -46,21 +46,21 @@ def refine_path(
     *,
     max_steps: int = 8,
 ) -> RefinedPath:
-    """Maximum a posteriori path through the knots, linear in between, given reads and a start within half a cycle.
+    """Maximum a posteriori distance at the knots, linear in between, from reads and a start within half a cycle.
 
-    Residuals: (phi_r - 4 pi f_r x(t_r) / c - offset) wrapped modulo pi (so that a pi flip counts for nothing) over
-    the read's noise, flattened for outliers; second differences of the knots over the acceleration prior. Solved by
-    Levenberg-Marquardt (Optimistix) with implicit gradients; the covariance is Laplace's.
+    Residuals: (phi_r - 4 pi f_r x(t_r) / c - offset) wrapped modulo pi (so that pi flips have no effect) over the read's
+    noise, flattened for outliers; second differences of the knots over the acceleration prior. Solved by
+    Levenberg-Marquardt (Optimistix) with implicit gradients; the covariance is the Laplace approximation.
     """
     dtype = knot_s.dtype
     weights = interpolation_weights(reads.time_s, knot_s)
     wavenumber = (4 * jnp.pi / SPEED_OF_LIGHT_M_S) * reads.carrier_hz
-    level = level_phase(reads, model, reference_hz)
+    level = remove_channel_slope(reads, model, reference_hz)
     sigma = jnp.sqrt(jnp.square(reads.sigma_rad) + model.multipath_rad**2)
     inside = reads.valid & (reads.time_s >= knot_s[0]) & (reads.time_s <= knot_s[-1])
     precision = jnp.where(inside, 1.0 / sigma, 0.0)
     gap = jnp.maximum(jnp.diff(knot_s), 1e-3)
-    # The start is given per knot; its own phase offset follows from the reads, as a circular mean modulo pi.
+    # The phase offset of the start is the circular mean of the reads' residuals modulo pi.
     doubled = 2.0 * (level - wavenumber * (weights @ start_m))
     offset = 0.5 * jnp.arctan2(
         jnp.sum(precision * jnp.sin(doubled)), jnp.sum(precision * jnp.cos(doubled)) + jnp.asarray(1e-12, dtype)
@@ -76,7 +76,7 @@ def refine_path(
         return jnp.concatenate([flattened, bend, ends])
 
     start = jnp.concatenate([start_m[1:] - start_m[0], (offset + jnp.zeros((), dtype))[None]])
-    # The offset absorbs the path's own zero, since the path of the unknowns begins at 0.
+    # The distances of the unknowns begin at 0, so the offset absorbs the first distance of the start.
     mean_wave = jnp.sum(precision * wavenumber) / jnp.maximum(jnp.sum(precision), 1e-9)
     start = start.at[-1].add(mean_wave * start_m[0])
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)

@@ -18,8 +18,8 @@ def resample_polynomial(
 ) -> tuple[Float[Array, " query"], Bool[Array, " query"]]:
     """Lagrange interpolation through the `order` + 1 samples around each query time.
 
-    The first `num_valid` samples count; they are in order of time, and of those of one time the first counts. Returns values and whether the query lies within
-    the samples; outside, the nearest sample is repeated.
+    The first `num_valid` samples are used; they are in order of time, and of samples of equal time the first is used.
+    Returns values and whether each query time is within the samples; outside, the nearest sample is repeated.
     """
     count = num_valid.astype(jnp.int32)
     usable = jnp.arange(time_s.shape[0]) < count

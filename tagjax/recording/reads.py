@@ -1,4 +1,4 @@
-"""Tag reads: one column an attribute, one row a read."""
+"""Tag reads as a table: one column per attribute, one row per read."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from ..core.errors import RecordingError, RecordingWarning
 
 
 def join_reads(parts: Sequence[TagReads]) -> TagReads:
-    """The reads of several tables in order of time. Raises `RecordingError` where their phase conventions differ."""
+    """The reads of several tables in order of time. Raises `RecordingError` if their phase conventions differ."""
     first = parts[0]
     for part in parts[1:]:
         if (part.phase_period_rad, part.phase_sign) != (first.phase_period_rad, first.phase_sign):
-            raise RecordingError("Reads of differing phase period or sign cannot be put into one table; convert first.")
+            raise RecordingError(
+                "The tables differ in phase period or sign; expected one convention. Convert them first."
+            )
     columns = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in dataclasses.fields(first)
@@ -28,10 +30,10 @@ def join_reads(parts: Sequence[TagReads]) -> TagReads:
 
 @dataclasses.dataclass(frozen=True)
 class TagReads:
-    """Tag reads in order of host time, one array element a read.
+    """Tag reads in order of host time, one array element per read.
 
     `carrier_hz` is NaN where the carrier is unknown (a channel index without its hop table); `doppler_hz` and
-    `rssi_dbm` are NaN where the reader gave none. `phase_rad` is as reported, in [0, phase_period_rad); it grows with
+    `rssi_dbm` are NaN where the reader reported none. `phase_rad` is as reported, in [0, phase_period_rad); it grows with
     distance where `phase_sign` is +1 (Impinj), shrinks where it is -1.
     """
 
@@ -72,7 +74,7 @@ class TagReads:
         found = self.epc == epc
         if not found.any():
             known = ", ".join(self.epcs) or "none"
-            raise RecordingError(f"EPC {epc!r} was never read. EPCs in this recording: {known}. Name one of these.")
+            raise RecordingError(f"EPC {epc!r} was never read. EPCs in this recording: {known}. Choose one of these.")
         return self[found]
 
     @classmethod
@@ -89,16 +91,16 @@ class TagReads:
         )
 
     def check(self) -> None:
-        """Raise `RecordingError` for reads that cannot be used; warn of those that can be, unusual as they are."""
+        """Raise `RecordingError` for reads that cannot be used; warn of unusual reads that can be used."""
         num_reads = self.num_reads
         for field in dataclasses.fields(self):
             column = getattr(self, field.name)
             if isinstance(column, np.ndarray) and column.shape != (num_reads,):
                 raise RecordingError(
-                    f"Tag reads: column {field.name} has shape {column.shape}; expected ({num_reads},) as time_ns has."
+                    f"Tag reads: column {field.name} has shape {column.shape}; expected ({num_reads},) like time_ns."
                 )
         if num_reads == 0:
-            warnings.warn("The recording holds no tag read: nothing can be traced.", RecordingWarning, stacklevel=3)
+            warnings.warn("The recording has no tag read: nothing can be traced.", RecordingWarning, stacklevel=3)
             return
         if np.any(np.diff(self.time_ns) < 0):
             first = int(np.argmax(np.diff(self.time_ns) < 0)) + 1

@@ -1,7 +1,7 @@
-"""The Recording: what a camera and a reader saw, with optional truth, on the host and opened lazily.
+"""Recordings: RGB-D video and tag reads, with optional ground truth; on the host, opened lazily.
 
-Everything here is NumPy (or a lazily read Zarr array); nothing touches a device. Times are int64 nanoseconds of the
-host clock. `Recording.check` holds a recording against what every later stage relies on.
+All arrays are NumPy arrays or lazily read Zarr arrays; none is on a device. Times are int64 nanoseconds of the host
+clock. `Recording.check` checks what every later stage relies on.
 """
 
 from __future__ import annotations
@@ -19,25 +19,27 @@ from ..core.types import LazyArray
 from .reads import TagReads
 
 MAX_RANGE_M = 30.0
-"""Depth beyond this is taken for a wrong unit: no RGB-D camera of the kind reaches it."""
+"""A median depth above this is taken for a wrong unit: no RGB-D camera of this kind measures so far."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """What is known to be true. Every part is optional; a lazily read array stays unread until indexed."""
+    """Ground truth. Every part is optional; lazily read arrays are read when indexed."""
 
-    labels: LazyArray | None = None  # (num_frames, height, width) uint8: 0 background, 255 ignore, else an object
+    labels: LazyArray | None = (
+        None  # (num_frames, height, width) uint8: 0 background, 255 ignore, else the object's label
+    )
     tag_to_label: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    boxes_px: np.ndarray | None = None  # (num_frames, num_labels, 4) float32 x0 y0 x1 y1 inclusive; NaN = unseen
+    boxes_px: np.ndarray | None = None  # (num_frames, num_labels, 4) float32 x0 y0 x1 y1 inclusive; NaN = not visible
     tag_range_m: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,), NaN unknown
     tag_position_m: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames, 3) camera
     visible: Mapping[int, np.ndarray] = dataclasses.field(default_factory=dict)  # label: (num_frames,) bool
     flow_px: LazyArray | None = None  # (num_frames, height, width, 2) flow from frame t to t + 1; last one NaN
-    occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is hidden
+    occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is occluded
     backward_flow_px: LazyArray | None = None  # (num_frames, height, width, 2) from frame t to t - 1; first one NaN
-    backward_occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is hidden
-    line_of_sight: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,) share of
-    # the field that reaches the first antenna straight: 1 free, 0 blocked
+    backward_occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is occluded
+    line_of_sight: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,)
+    # fraction of the field that reaches the first antenna on the direct path: 1 free, 0 blocked
 
     IGNORE = 255
 
@@ -50,7 +52,7 @@ class ClockAudit:
     drift_ppm: float
     residual_ms: float
     num_reads: int
-    reader_epoch: str  # "unix", "1970" or "2000": the latter two say that the reader's clock was never set
+    reader_epoch: str  # "unix", or "1970" or "2000" for a reader clock that was never set
     note: str = ""
 
 
@@ -73,9 +75,9 @@ class Recording:
     truth: Truth | None = None
     clock: ClockAudit | None = None
     name: str = "recording"
-    source: str = ""  # what it was made from, and how
-    store: Any = None  # the open Zarr group, where it comes from one
-    forwards: Recording | None = None  # the recording that this one is, played backwards
+    source: str = ""  # data and settings that it was made from
+    store: Any = None  # the open Zarr group, for a stored recording
+    reversed_from: Recording | None = None  # the original of a time-reversed recording
 
     @property
     def num_frames(self) -> int:
@@ -101,7 +103,7 @@ class Recording:
         return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
 
     def resolve_epcs(self, epcs: Sequence[str] | None) -> list[str]:
-        """The given EPCs, each checked to have been read; all that were read if None."""
+        """The given EPCs, or all EPCs that were read if None. Raises `RecordingError` for an EPC that was never read."""
         if epcs is None:
             return self.reads.epcs
         for epc in epcs:
@@ -113,19 +115,19 @@ class Recording:
         return dataclasses.replace(self, reads=reads, truth=self.truth if truth is None else truth)
 
     def check(self, *, depth: bool = True) -> None:
-        """Raise `RecordingError` where a later stage could not go on; warn where it can.
+        """Raise `RecordingError` for a recording that later stages cannot process; warn of one that is unusual.
 
-        Reads frame metadata and three depth frames only, so that it stays cheap for a remote recording; nothing is asked
-        of depth without `depth`. A recording that has none is warned of: TagAttention needs it, the forerunners do not.
+        Reads metadata and three depth frames only, so that it is cheap for a remote recording; depth is not checked
+        unless `depth`. A recording without any depth gives a warning: TagAttention needs depth, the baselines do not.
         """
         num_frames, shape = self.num_frames, self.image_shape
         if num_frames == 0:
-            raise RecordingError(f"{self.name}: no frame. A recording needs at least one.")
+            raise RecordingError(f"{self.name}: no frames; expected at least one.")
         self.intrinsics.check()
         if self.colour.shape != (num_frames, *shape, 3) or self.colour.dtype != np.uint8:
             raise RecordingError(
                 f"{self.name}: colour is {self.colour.dtype} of shape {self.colour.shape}; expected uint8 of shape "
-                f"{(num_frames, *shape, 3)} (frames, height, width, RGB) as times and intrinsics say."
+                f"{(num_frames, *shape, 3)} (frames, height, width, RGB) from times and intrinsics."
             )
         if depth and self.depth.shape != (num_frames, *shape):
             raise RecordingError(
@@ -152,7 +154,7 @@ class Recording:
             highest = int(self.reads.antenna.max())
             if highest > len(self.antennas_m):
                 raise RecordingError(
-                    f"{self.name}: reads of antenna {highest}, but antennas_m places {len(self.antennas_m)}. Give all places."
+                    f"{self.name}: reads of antenna {highest}, but antennas_m has {len(self.antennas_m)} positions. Give the position of every antenna."
                 )
             inside = (self.reads.time_ns >= self.time_ns[0]) & (self.reads.time_ns <= self.time_ns[-1])
             if not inside.any():
@@ -163,11 +165,11 @@ class Recording:
                 )
 
     def check_has_depth(self) -> None:
-        """Raise `RecordingError` where none of the frames that `check` looks at has any depth."""
+        """Raise `RecordingError` if none of the frames that `check` samples has any depth."""
         sampled, values = self._sampled_depth()
         if not np.any(values > 0):
             raise RecordingError(
-                f"{self.name}: frames {sampled} hold no depth at all; TagAttention needs depth. Was it exported?"
+                f"{self.name}: frames {sampled} have no depth at all; TagAttention needs depth. Was it exported?"
             )
 
     def _sampled_depth(self) -> tuple[list[int], np.ndarray]:
@@ -179,8 +181,8 @@ class Recording:
         measured = values[values > 0]
         if measured.size == 0:
             warnings.warn(
-                f"{self.name}: frames {sampled} hold no depth at all: TagAttention cannot trace here, only systems that "
-                "need none. Was it exported?",
+                f"{self.name}: frames {sampled} have no depth at all: only systems that need no depth can trace here, not "
+                "TagAttention. Was it exported?",
                 RecordingWarning,
                 stacklevel=4,
             )
@@ -193,5 +195,7 @@ class Recording:
         for frame, image in zip(sampled, values, strict=True):
             if not np.any(image > 0):
                 warnings.warn(
-                    f"{self.name}: frame {frame} has no depth; it is carried.", RecordingWarning, stacklevel=4
+                    f"{self.name}: frame {frame} has no depth; the tracer propagates its state over it.",
+                    RecordingWarning,
+                    stacklevel=4,
                 )

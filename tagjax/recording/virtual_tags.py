@@ -1,4 +1,4 @@
-"""Virtual tags: reads that a tag would have given had it followed a known track, for real or simulated video."""
+"""Virtual tags: simulated reads of a tag on a known track, for real or simulated video."""
 
 from __future__ import annotations
 
@@ -24,38 +24,40 @@ from ..radio.reader import (
     read_times,
     rssi_at,
 )
-from .reads import TagReads
+from .reads import TagReads, join_reads
 from .recording import Recording, Truth
 
 MAX_GAP_FRAMES = 2
-"""A track that misses more frames than this is out of view: it breaks into pieces, and no read falls between them."""
+"""A gap of more frames than this splits a track into segments; there are no reads within the gap."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Where something was: one row a frame, NaN where it was not seen. Camera frame, metres."""
+    """Positions of an object: one row per frame, NaN where it was not observed. Camera frame, metres."""
 
     time_s: np.ndarray  # (num_frames,)
     position_m: np.ndarray  # (num_frames, 3)
 
-    def pieces(self) -> list[np.ndarray]:
-        """Frame indices of each stretch without a gap of more than `MAX_GAP_FRAMES` frames and of 2 frames at least."""
-        seen = np.flatnonzero(np.all(np.isfinite(self.position_m), axis=1))
-        if not seen.size:
+    def segments(self) -> list[np.ndarray]:
+        """Frame indices of each segment of at least 2 frames without a gap of more than `MAX_GAP_FRAMES` frames."""
+        observed = np.flatnonzero(np.all(np.isfinite(self.position_m), axis=1))
+        if not observed.size:
             return []
         return [
-            part for part in np.split(seen, np.flatnonzero(np.diff(seen) > MAX_GAP_FRAMES + 1) + 1) if len(part) > 1
+            part
+            for part in np.split(observed, np.flatnonzero(np.diff(observed) > MAX_GAP_FRAMES + 1) + 1)
+            if len(part) > 1
         ]
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
-        """Position at any time, (len(time_s), 3); NaN outside the pieces.
+        """Position at any time, (len(time_s), 3) metres; NaN outside the segments.
 
-        Cubic Hermite between frames with central-difference velocities: smooth, so that the phase between frames is
-        that of a body, even where the range changes by more than half a wavelength from one frame to the next.
+        Cubic Hermite interpolation with central-difference velocities, so that phases between frames are those of smooth
+        motion, even if the range changes by more than half a wavelength per frame.
         """
         out = np.full((len(time_s), 3), np.nan)
-        for piece in self.pieces():
-            t, x = self.time_s[piece], self.position_m[piece]
+        for segment in self.segments():
+            t, x = self.time_s[segment], self.position_m[segment]
             velocity = np.gradient(x, t, axis=0)
             inside = (time_s >= t[0]) & (time_s <= t[-1])
             out[inside] = CubicHermiteSpline(t, x, velocity)(time_s[inside])
@@ -63,9 +65,9 @@ class Track:
 
 
 def load_tracks_csv(path: str | Path, frame_time_s: np.ndarray) -> dict[int, Track]:
-    """Tracks by label from a table frame,person,x_m,y_m,z_m,... with frames counted from 1.
+    """Tracks by label from a CSV table frame,person,x_m,y_m,z_m,... with frames counted from 1.
 
-    Missing columns, numbers that are none, and frames outside the recording raise `RecordingError`.
+    Raises `RecordingError` for missing columns, values that are not numbers, and frames outside the recording.
     """
     path = Path(path)
     if not path.is_file():
@@ -79,15 +81,15 @@ def load_tracks_csv(path: str | Path, frame_time_s: np.ndarray) -> dict[int, Tra
         for line, row in enumerate(rows, start=2):
             try:
                 frame, label = int(row["frame"]) - 1, int(row["person"])
-                place = [float(row[name]) for name in ("x_m", "y_m", "z_m")]
+                position = [float(row[name]) for name in ("x_m", "y_m", "z_m")]
             except (TypeError, ValueError) as error:
                 raise RecordingError(f"{path}, line {line}: {error}. Expected numbers.") from error
             if not 0 <= frame < len(frame_time_s):
                 raise RecordingError(
                     f"{path}, line {line}: frame {frame + 1}; the recording has frames 1 to {len(frame_time_s)}."
                 )
-            positions.setdefault(label, np.full((len(frame_time_s), 3), np.nan))[frame] = place
-    return {label: Track(np.asarray(frame_time_s, float), place) for label, place in sorted(positions.items())}
+            positions.setdefault(label, np.full((len(frame_time_s), 3), np.nan))[frame] = position
+    return {label: Track(np.asarray(frame_time_s, float), position) for label, position in sorted(positions.items())}
 
 
 def virtual_reads(
@@ -100,18 +102,18 @@ def virtual_reads(
     origin_ns: int = 0,
     reader: ReaderState | None = None,
 ) -> TagReads:
-    """Reads of a tag on a track: schedule, hopping, phase with noise, ripple and pi flips, RSSI, Doppler.
+    """Simulated reads of a tag on a track: schedule, hopping, phase with noise, multipath ripple and pi flips, RSSI, Doppler.
 
-    Times are drawn over the whole track; reads while the tag is out of view, or too weak to hear, do not happen. The
-    same seed gives the same reads.
+    Read times are drawn over the whole track; reads without a position or below the reader's sensitivity are left out.
+    The same seed gives the same reads.
     """
     rng = np.random.default_rng([seed, *epc.encode()])
     state = reader or ReaderState.draw(settings, rng)
     time_s = read_times(float(track.time_s[0]), float(track.time_s[-1]), settings, rng)
     range_m = np.linalg.norm(track.at(time_s) - antenna_m, axis=1)
     rssi = rssi_at(np.nan_to_num(range_m, nan=1.0), rng)
-    heard = np.isfinite(range_m) & (rssi >= SENSITIVITY_DBM)
-    time_s, range_m, rssi = time_s[heard], range_m[heard], rssi[heard]
+    received = np.isfinite(range_m) & (rssi >= SENSITIVITY_DBM)
+    time_s, range_m, rssi = time_s[received], range_m[received], rssi[received]
     index = channel_at(time_s, state, settings)
     carrier = state.hop_table_hz[index]
     count = len(time_s)
@@ -142,7 +144,7 @@ def virtual_reads(
 
 
 def default_epc(label: int) -> str:
-    """A 96-bit EPC that ends in the label."""
+    """A 96-bit EPC whose last digits are the label."""
     return f"E28011{label:018X}"
 
 
@@ -154,7 +156,7 @@ def attach_virtual_tags(
     seed: int,
     epc_of: Callable[[int], str] = default_epc,
 ) -> Recording:
-    """The recording with a virtual tag on each track instead of its own reads; truth says which and where.
+    """The recording with a virtual tag on each track instead of its own reads; the truth has labels, ranges and positions.
 
     All tags are read by one reader at the first antenna, each on the schedule of `settings`.
     """
@@ -172,15 +174,7 @@ def attach_virtual_tags(
         to_label[epc] = int(label)
         positions[epc] = track.at(frame_s)
         ranges[epc] = np.linalg.norm(positions[epc] - antenna, axis=1)
-    columns = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts])
-        for field in dataclasses.fields(TagReads)
-        if parts and isinstance(getattr(parts[0], field.name), np.ndarray)
-    }
-    reads = TagReads.empty()
-    if parts:
-        joined = dataclasses.replace(parts[0], **columns)
-        reads = joined[np.argsort(joined.time_ns, kind="stable")]
+    reads = join_reads(parts) if parts else TagReads.empty()
     truth = dataclasses.replace(
         recording.truth or Truth(), tag_to_label=to_label, tag_range_m=ranges, tag_position_m=positions
     )

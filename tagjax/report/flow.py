@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from ..flow.pictures import as_bytes
+from ..flow.images import to_uint8
 
 _ARCS = (15, 6, 4, 11, 13, 6)
 """Steps from red to yellow, green, cyan, blue, magenta, and back to red."""
@@ -90,7 +90,7 @@ def flow_panel(
     drawn = list(flows_px.values()) if truth_px is None else [truth_px]
     lengths = np.concatenate([np.linalg.norm(flow, axis=-1).ravel() for flow in drawn])
     largest_px = max(1.0, float(np.percentile(lengths[np.isfinite(lengths)], 99))) if lengths.size else 1.0
-    top: list[Tile] = [("first", as_bytes(first)), ("second", as_bytes(second))]
+    top: list[Tile] = [("first", to_uint8(first)), ("second", to_uint8(second))]
     if truth_px is not None:
         top.append((f"true flow, full colour at {largest_px:.1f} px", flow_colours(truth_px, largest_px)))
     names = list(flows_px)

@@ -18,12 +18,12 @@ from typing import Any, Literal
 import jax.numpy as jnp
 
 from ..core.parameters import (
+    check_fractions,
     check_positive,
-    check_shares,
-    check_whole,
+    check_positive_integers,
+    log_parameter,
+    logit_parameter,
     physical,
-    stored_log,
-    stored_logit,
     with_physical,
 )
 from ._stages import AbstractStages
@@ -216,7 +216,7 @@ class TagAttention(AbstractStages):
             max_speed_m_s=max_speed_m_s,
             rest_nats=rest_nats,
         )
-        check_shares(
+        check_fractions(
             beta=beta,
             background=background,
             profile=profile,
@@ -231,37 +231,40 @@ class TagAttention(AbstractStages):
             range_share=range_share,
             box_tail=box_tail,
         )
-        check_whole(cell=cell, anchor_bins=anchor_bins)
-        self.log_alpha, self.logit_beta = stored_log(alpha_m2), stored_logit(beta)
-        self.log_floor, self.logit_background = stored_log(floor), stored_logit(background)
-        self.logit_profile, self.log_slack = stored_logit(profile), stored_log(slack)
-        self.log_noise_share, self.logit_rest = stored_log(noise_share), stored_logit(rest)
-        self.log_coherent_weight = stored_log(coherent_weight)
+        check_positive_integers(cell=cell, anchor_bins=anchor_bins)
+        self.log_alpha, self.logit_beta = log_parameter(alpha_m2), logit_parameter(beta)
+        self.log_floor, self.logit_background = log_parameter(floor), logit_parameter(background)
+        self.logit_profile, self.log_slack = logit_parameter(profile), log_parameter(slack)
+        self.log_noise_share, self.logit_rest = log_parameter(noise_share), logit_parameter(rest)
+        self.log_coherent_weight = log_parameter(coherent_weight)
         self.coherent_level = jnp.asarray(coherent_level, jnp.float32)
-        self.log_phase_weight, self.log_phase_slack = stored_log(phase_weight), stored_log(phase_slack)
-        self.log_phase_spread = stored_log(phase_spread_rad)
-        self.log_phase_rest_spread = stored_log(phase_rest_spread_rad)
-        self.logit_phase_outlier = stored_logit(phase_outlier)
-        self.log_v0, self.log_gate_width = stored_log(v0_m_s), stored_log(gate_width_m_s)
-        self.log_memory, self.log_evidence_limit = stored_log(memory_s), stored_log(evidence_limit)
-        self.logit_pool_motion, self.logit_pool_log_odds = stored_logit(pool_motion), stored_logit(pool_log_odds)
-        self.log_segment_temperature = stored_log(segment_temperature)
-        self.logit_diffusion = stored_logit(diffusion)
-        self.log_affinity_length, self.log_affinity_speed = stored_log(affinity_length), stored_log(affinity_speed_m_s)
+        self.log_phase_weight, self.log_phase_slack = log_parameter(phase_weight), log_parameter(phase_slack)
+        self.log_phase_spread = log_parameter(phase_spread_rad)
+        self.log_phase_rest_spread = log_parameter(phase_rest_spread_rad)
+        self.logit_phase_outlier = logit_parameter(phase_outlier)
+        self.log_v0, self.log_gate_width = log_parameter(v0_m_s), log_parameter(gate_width_m_s)
+        self.log_memory, self.log_evidence_limit = log_parameter(memory_s), log_parameter(evidence_limit)
+        self.logit_pool_motion, self.logit_pool_log_odds = logit_parameter(pool_motion), logit_parameter(pool_log_odds)
+        self.log_segment_temperature = log_parameter(segment_temperature)
+        self.logit_diffusion = logit_parameter(diffusion)
+        self.log_affinity_length, self.log_affinity_speed = (
+            log_parameter(affinity_length),
+            log_parameter(affinity_speed_m_s),
+        )
         self.cut = jnp.asarray(cut, jnp.float32)
-        self.log_cut_width, self.log_cut_margin = stored_log(cut_width), stored_log(cut_margin)
-        self.logit_cut_share = stored_logit(cut_share)
-        self.log_extent = stored_log(extent_m)
-        self.log_prior_weight, self.log_prior_reach = stored_log(prior_weight), stored_log(prior_reach)
-        self.logit_inertia, self.logit_size_rate = stored_logit(inertia), stored_logit(size_rate)
-        self.logit_range_share = stored_logit(range_share)
-        self.log_anchor_weight, self.log_anchor_width = stored_log(anchor_weight), stored_log(anchor_width_m)
-        self.log_anchor_depth, self.log_anchor_limit = stored_log(anchor_depth_m), stored_log(anchor_limit)
-        self.log_anchor_drift, self.log_anchor_rate = stored_log(anchor_drift_m), stored_log(anchor_rate)
+        self.log_cut_width, self.log_cut_margin = log_parameter(cut_width), log_parameter(cut_margin)
+        self.logit_cut_share = logit_parameter(cut_share)
+        self.log_extent = log_parameter(extent_m)
+        self.log_prior_weight, self.log_prior_reach = log_parameter(prior_weight), log_parameter(prior_reach)
+        self.logit_inertia, self.logit_size_rate = logit_parameter(inertia), logit_parameter(size_rate)
+        self.logit_range_share = logit_parameter(range_share)
+        self.log_anchor_weight, self.log_anchor_width = log_parameter(anchor_weight), log_parameter(anchor_width_m)
+        self.log_anchor_depth, self.log_anchor_limit = log_parameter(anchor_depth_m), log_parameter(anchor_limit)
+        self.log_anchor_drift, self.log_anchor_rate = log_parameter(anchor_drift_m), log_parameter(anchor_rate)
         self.anchor_unseen = jnp.asarray(anchor_unseen, jnp.float32)
-        self.log_fate_weight, self.log_fate_slack = stored_log(fate_weight), stored_log(fate_slack)
-        self.log_fate_spread = stored_log(fate_spread_m)
-        self.log_foreground_weight, self.log_rivalry = stored_log(foreground_weight), stored_log(rivalry)
+        self.log_fate_weight, self.log_fate_slack = log_parameter(fate_weight), log_parameter(fate_slack)
+        self.log_fate_spread = log_parameter(fate_spread_m)
+        self.log_foreground_weight, self.log_rivalry = log_parameter(foreground_weight), log_parameter(rivalry)
         self.rest_doubt, self.rest_nats = jnp.asarray(rest_doubt, jnp.float32), rest_nats
         self.cell, self.max_speed_m_s = cell, max_speed_m_s
         self.box_tail, self.doubled_angle = box_tail, doubled_angle

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..core.parameters import check_positive, check_shares, check_whole
+from ..core.parameters import check_fractions, check_positive, check_positive_integers
 from ..image.warp import splat
 from ..tracing.tracer import AbstractTracer, Camera, Frame, Trace
 from .attention import att_corr, att_rbf, attention, centre_first
@@ -51,11 +51,11 @@ class TagAttentionPaper(AbstractTracer):
         # What is being traced has no value yet.
         told = {name: leaf for name, leaf in vars(self).items() if not isinstance(leaf, Tracer)}
         check_positive(**{name: round(float(told[name]), 9) for name in told.keys() & {"alpha_m2"}})
-        check_shares(**{name: round(float(told[name]), 6) for name in told.keys() & {"beta", "forgetting"}})
+        check_fractions(**{name: round(float(told[name]), 6) for name in told.keys() & {"beta", "forgetting"}})
         for name in told.keys() & {"v0_m_s", "softness"}:
             if not told[name] >= 0:
                 raise ValueError(f"{name} is {told[name]:g}; expected at least 0.")
-        check_whole(cell=self.cell)
+        check_positive_integers(cell=self.cell)
 
     def init(self, camera: Camera, frame: Frame) -> PaperState:
         height, width = frame.depth_m.shape

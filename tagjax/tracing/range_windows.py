@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.numerics import SPEED_OF_LIGHT_M_S
+from ..radio.bayes_filter import FilteredPath, RadioModel, filter_reads, reference_carrier
 from ..radio.channels import estimate_slope
-from ..radio.grid_filter import FilteredPath, RadioModel, filter_reads, reference_carrier
-from ..radio.noise import pi_flip_share, thermal_sigma_rad
+from ..radio.noise import estimate_flip_probability, thermal_sigma_rad
 from ..radio.reads import PhaseReads, RadioWindow
 from ..radio.refine import refine_path
 from ..radio.resample import resample_polynomial
@@ -79,10 +79,10 @@ def radio_model(reads: PhaseReads, **settings: float) -> RadioModel:
     """
     valid = np.asarray(reads.valid)
     host = {name: np.asarray(getattr(reads, name))[valid] for name in ("phase_rad", "time_s", "channel", "carrier_hz")}
-    share = pi_flip_share(host["phase_rad"], host["time_s"], host["channel"])
+    share = estimate_flip_probability(host["phase_rad"], host["time_s"], host["channel"])
     slope = estimate_slope(host["phase_rad"], host["time_s"], host["channel"], host["carrier_hz"])
     chosen: dict[str, Any] = {
-        "flip_share": float(np.clip(share, 0.01, 0.45)) if np.isfinite(share) else DEFAULT_FLIP_SHARE,
+        "flip_probability": float(np.clip(share, 0.01, 0.45)) if np.isfinite(share) else DEFAULT_FLIP_SHARE,
         "slope_rad_hz": slope.slope_rad_hz,
         "hop_rad": slope.residual_rad,
     }

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..radio.reads import RadioWindow
 from ..recording import Recording, RecordingError
-from ..recording.backwards import played_backwards
+from ..recording.time_reversal import time_reversed
 from .tracer import AbstractSmoother, AbstractTracer, BackwardMessage, Camera, Frame, Trace
 
 
@@ -152,7 +152,7 @@ def _backward_pass(
     kept: dict[int, BackwardMessage] = {}
     log_odds: np.ndarray | None = None
     for number, outputs in _run(
-        _step_back, tracer, played_backwards(recording), load, epcs, settings, (count - last, count - first)
+        _step_back, tracer, time_reversed(recording), load, epcs, settings, (count - last, count - first)
     ):
         message: BackwardMessage = jax.tree.map(lambda *leaves: np.concatenate(leaves), *outputs)
         if log_odds is None:

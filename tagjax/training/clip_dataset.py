@@ -183,4 +183,4 @@ def clip_dataset(
         colour=colour,
     )
     dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()
-    return Stream(dataset, workers=workers, share=share, finish=_on_device if workers else None)
+    return Stream(dataset, workers=workers, shard=share, transform=_on_device if workers else None)

@@ -21,7 +21,9 @@ class TrainConfig:
 
     tracer: Mapping[str, Any]
     optimizer: Mapping[str, Any]
-    weights: str | None = None  # learned parameters to begin with: `default`, a name, or a file (tagjax.tagattention.learned)
+    weights: str | None = (
+        None  # learned parameters to begin with: `default`, a name, or a file (tagjax.tagattention.learned)
+    )
     baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside it
     baseline_estimators: Mapping[str, str] = dataclasses.field(
         default_factory=dict

@@ -17,11 +17,12 @@ from rich.table import Table
 
 from ..core.build import build
 from ..core.machine import machine
-from ..flow.estimates import NetworkFlow, one_way
+from ..flow.augmentation import AugmentationSettings
+from ..flow.estimates import NetworkFlow, forward_flow
+from ..flow.image_sequences import open_sequence
 from ..flow.losses import FlowLossSettings
-from ..flow.named import make_flow
 from ..flow.network import AbstractFlowNetwork
-from ..flow.picture_pairs import VariationSettings, open_sequence
+from ..flow.registry import make_flow
 from ..flow.weights import load_weights, save_weights
 from ..metrics.flow import FlowScores
 from ..report.report import write_json
@@ -59,7 +60,7 @@ def initial_network(settings: Mapping[str, Any], weights: str | None) -> Abstrac
 def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console | None = None) -> float:
     """Train as configured and return the mean end-point error on drawn validation pairs, pixels; NaN if interrupted.
 
-    `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.npz, which `data.clips.flow=<path>` uses. An
+    `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.safetensors, which `data.clips.flow=<path>` uses. An
     interrupted run goes on from its newest checkpoint when started again in the same folder. Of several processes
     (`config.distributed`) only the first writes.
     """
@@ -101,7 +102,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
                     logger=logger,
                     checkpoints=checkpoints,
                     validate=validate,
-                    shown=("loss", "data", "hidden_share") if config.data.teacher is None else ("loss",),
+                    shown=("loss", "data", "occluded_fraction") if config.data.teacher is None else ("loss",),
                 )
         finally:
             logger.close()
@@ -127,7 +128,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
         "photographs": installed_photographs() if config.data.drawn.photographs else [],
         **summary,
     }
-    save_weights(folder / "weights.npz", learned, about)
+    save_weights(folder / "weights.safetensors", learned, about)
     console.print(_table(found))
     if warped:
         told = ", ".join(f"{name} {levels:.2f}" for name, levels in warped.items())
@@ -138,7 +139,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     return found["learned"]["all"]
 
 
-def _check_sizes(network: AbstractFlowNetwork, variation: VariationSettings, loss: FlowLossSettings) -> None:
+def _check_sizes(network: AbstractFlowNetwork, variation: AugmentationSettings, loss: FlowLossSettings) -> None:
     for name in ("height", "width", "margin_px"):
         value = getattr(variation, name)
         if value % network.divisor:
@@ -160,7 +161,7 @@ def _check_sizes(network: AbstractFlowNetwork, variation: VariationSettings, los
 
 @eqx.filter_jit
 def _flows(network: AbstractFlowNetwork, first: jax.Array, second: jax.Array) -> jax.Array:
-    return jax.vmap(functools.partial(one_way, network))(first, second)
+    return jax.vmap(functools.partial(forward_flow, network))(first, second)
 
 
 def flow_of(network: AbstractFlowNetwork, pairs: FlowPair, batch: int = 8) -> np.ndarray:
@@ -174,7 +175,7 @@ def flow_of(network: AbstractFlowNetwork, pairs: FlowPair, batch: int = 8) -> np
 
 
 def flow_of_peer(name: str, pairs: FlowPair) -> np.ndarray:
-    """The flow of stacked pairs by a flow of that name (`tagjax.flow.named`)."""
+    """The flow of stacked pairs by a flow of that name (`tagjax.flow.registry`)."""
     flow = make_flow(name)
     first, second = (np.rint(255 * np.asarray(pictures)).astype(np.uint8) for pictures in (pairs.first, pairs.second))
     return np.stack([flow(a, b) for a, b in zip(first, second, strict=True)])

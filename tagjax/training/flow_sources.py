@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
-from ..core.prepared import made_once, write_rows
+from ..core.array_cache import cached_array, write_rows
 from ..core.stream import Stream
 from ..core.types import LazyArray
-from ..flow.picture_pairs import PairSource, StackedPairs, TaughtPairs, VariationSettings, open_sequence, pair_dataset
+from ..flow.augmentation import AugmentationSettings
+from ..flow.image_pairs import PairSource, StackedPairs, TeacherPairs, pair_dataset
+from ..flow.image_sequences import open_sequence
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.rendering.textures import PHOTOGRAPHS, photograph
 from .flow_teacher import cut_pairs, taught_flow
@@ -54,7 +56,7 @@ class FlowDataSettings:
     drawn: DrawnSettings = dataclasses.field(default_factory=DrawnSettings)
     sequences: tuple[str, ...] = ()  # recordings, videos, folders of pictures: never labelled
     sequence_fraction: float = 0.5  # of the samples, all sequences together; the rest is drawn
-    variation: VariationSettings = dataclasses.field(default_factory=VariationSettings)
+    variation: AugmentationSettings = dataclasses.field(default_factory=AugmentationSettings)
     teacher: str | None = None  # a flow by name, whose word is all that is learned from
     cuts_per_sequence: int = 24  # pairs of the drawn ones' size that the teacher is asked for
     workers: int = 0  # processes that read and vary pairs
@@ -102,7 +104,7 @@ def drawn_pairs(settings: DrawnSettings, *, progress: bool = True) -> LazyArray:
     del about["folder"], about["num_validation"]
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
     target = Path(settings.folder) / f"flow-pairs-{settings.num_pairs}-{digest}.zarr"
-    return made_once(target, lambda path: _draw(settings, path, about, progress))
+    return cached_array(target, lambda path: _draw(settings, path, about, progress))
 
 
 def _draw(settings: DrawnSettings, path: Path, about: dict, progress: bool) -> None:
@@ -149,7 +151,7 @@ def flow_dataset(
     sequences = [open_sequence(path, Path(settings.drawn.folder)) for path in settings.sequences]
     lengths = [sequence.shape[0] for sequence in sequences]
     whole = settings.sequence_fraction if settings.drawn.num_pairs else 1.0
-    sources: list[PairSource | StackedPairs | TaughtPairs] = []
+    sources: list[PairSource | StackedPairs | TeacherPairs] = []
     for number, sequence in enumerate(sequences):
         if settings.teacher is None:
             sources.append(PairSource(sequence, settings.variation.gaps))
@@ -164,8 +166,8 @@ def flow_dataset(
             StackedPairs(pairs) if settings.teacher is None else _taught(pairs, settings, settings.teacher, progress)
         )
         shares.append(1 - whole if sequences else 1.0)
-    return pair_dataset(sources, shares, settings.variation, seed=seed, workers=settings.workers, share=share)
+    return pair_dataset(sources, shares, settings.variation, seed=seed, workers=settings.workers, shard=share)
 
 
-def _taught(pairs: LazyArray | np.ndarray, settings: FlowDataSettings, teacher: str, progress: bool) -> TaughtPairs:
-    return TaughtPairs(pairs, taught_flow(pairs, teacher, Path(settings.drawn.folder), progress=progress))
+def _taught(pairs: LazyArray | np.ndarray, settings: FlowDataSettings, teacher: str, progress: bool) -> TeacherPairs:
+    return TeacherPairs(pairs, taught_flow(pairs, teacher, Path(settings.drawn.folder), progress=progress))

@@ -12,16 +12,8 @@ import optax
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from ..core.compilation import large_program
-from ..flow.losses import (
-    FlowLossSettings,
-    imitation_term,
-    level_terms,
-    margin_of,
-    occluded,
-    sequence_terms,
-    teaching_term,
-    weighted,
-)
+from ..flow.loss_terms import crop_margin_px, occluded, self_supervision_term
+from ..flow.losses import FlowLossSettings, distillation_term, level_terms, sequence_terms, total_loss
 from ..flow.network import AbstractFlowNetwork, Levels, flow_both_ways
 from .devices import check_batch, copied, spread
 
@@ -61,15 +53,17 @@ def pair_terms(
     forward, backward = flow_both_ways(network, seen[0], seen[1])
     terms = terms_both_ways(forward, backward, clean, seen.shape[1:3], hide, settings)
     if not teach:
-        return {**terms, "teaching": jnp.zeros(())}
+        return {**terms, "self_supervision": jnp.zeros(())}
     border = settings.self_supervision_border_px
     small = seen[:, border:-border, border:-border]
     there, back = flow_both_ways(network, small[0], small[1])
     parts = [
-        teaching_term(mine[-1], whole[-1], occluded(mine[-1], other[-1]), occluded(whole[-1], whole_other[-1]), border)
+        self_supervision_term(
+            mine[-1], whole[-1], occluded(mine[-1], other[-1]), occluded(whole[-1], whole_other[-1]), border
+        )
         for mine, other, whole, whole_other in ((there, back, forward, backward), (back, there, backward, forward))
     ]
-    return {**terms, "teaching": (parts[0] + parts[1]) / 2}
+    return {**terms, "self_supervision": (parts[0] + parts[1]) / 2}
 
 
 def terms_both_ways(
@@ -81,7 +75,7 @@ def terms_both_ways(
     settings: FlowLossSettings,
 ) -> dict[str, Float[Array, ""]]:
     """Terms of estimates for the middle of two pictures, a part of (height, width) `size`; the mean of both ways."""
-    margin, (height, width) = margin_of(size, clean.shape[1:3]), size
+    margin, (height, width) = crop_margin_px(size, clean.shape[1:3]), size
     middle = clean[:, margin : margin + height, margin : margin + width]
     terms_of = sequence_terms if settings.sequence_decay > 0 else level_terms
     # Mapped, not written twice: less to compile.
@@ -105,8 +99,8 @@ def batch_loss(
     found = jax.tree.map(jnp.mean, one(clean, seen))
     begun = (step - settings.self_supervision_after).astype(jnp.float32)
     ramp = jnp.clip(begun / max(settings.self_supervision_ramp, 1), 0.0, 1.0)
-    found["teaching"] = ramp * found["teaching"]
-    return weighted(found, settings), found
+    found["self_supervision"] = ramp * found["self_supervision"]
+    return total_loss(found, settings), found
 
 
 def imitation_loss(
@@ -115,10 +109,10 @@ def imitation_loss(
     teacher_px: Float[Array, "batch height width 2"],
     settings: FlowLossSettings,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Mean over a batch of `imitation_term`, first to second picture; it is the whole loss of a student."""
+    """Mean over a batch of `distillation_term`, first to second picture; it is the whole loss of a student."""
 
     def one(pair: Array, flow_px: Array) -> Array:
-        return imitation_term(network.decode(network.encode(pair[0]), network.encode(pair[1])), flow_px, settings)
+        return distillation_term(network.decode(network.encode(pair[0]), network.encode(pair[1])), flow_px, settings)
 
     value = jnp.mean(jax.vmap(one)(seen, teacher_px))
     return value, {"imitation": value}
@@ -133,7 +127,7 @@ def _update(
     average_over: float,
     teach: bool,
 ) -> tuple[FlowTrainState, dict[str, Array]]:
-    clean, seen = (samples[name].astype(jnp.float32) / 255 for name in ("clean", "seen"))
+    clean, seen = (samples[name].astype(jnp.float32) / 255 for name in ("clean", "augmented"))
     learnable, rest = eqx.partition(state.network, eqx.is_inexact_array)
 
     def loss(learnable: PyTree) -> tuple[Array, dict[str, Array]]:

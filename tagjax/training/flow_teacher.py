@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from ..core.prepared import made_once, write_rows
+from ..core.array_cache import cached_array, write_rows
 from ..core.types import LazyArray
-from ..flow.named import flow_key, make_flow
+from ..flow.registry import flow_key, make_flow
 from ..recording import RecordingError
 
 _SHARD = 64
@@ -61,7 +61,7 @@ def taught_flow(
     Made once and kept in `folder`, under the digest of the pairs and the teacher's key. Errors as of `make_flow`.
     """
     target = folder / f"flow-of-{_digest(pairs)}-{flow_key(teacher)}.zarr"
-    return made_once(target, lambda path: _teach(pairs, teacher, path, progress))
+    return cached_array(target, lambda path: _teach(pairs, teacher, path, progress))
 
 
 def _teach(pairs: LazyArray | np.ndarray, teacher: str, path: Path, progress: bool) -> None:

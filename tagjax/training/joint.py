@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, UInt8
 
 from ..core.settings import ConfigError
 from ..flow.estimates import padding
-from ..flow.losses import FlowLossSettings, weighted
+from ..flow.losses import FlowLossSettings, total_loss
 from ..flow.network import AbstractFlowNetwork, flow_both_ways
-from ..flow.stillness import has_moved
+from ..flow.stationary import is_moving
 from ..flow.weights import save_weights
 from ..tracing.tracer import AbstractTracer, Frame
 from .flow_step import terms_both_ways
@@ -51,7 +51,7 @@ def network_flow(
 ) -> tuple[Flow, Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The flow of a clip's pictures at its working resolution, and the network's loss on them with its terms.
 
-    As in the cache, flow that explains no more than rest is zero (`has_moved`); the loss is of the flow before that, on
+    As in the cache, flow that explains no more than rest is zero (`is_moving`); the loss is of the flow before that, on
     the whole pictures, which repeat their edges where the network asks for other sizes.
     """
     if frames.colour is None:
@@ -70,7 +70,7 @@ def network_flow(
         place = tuple(slice(before, before + size) for (before, _), size in zip(sides, (height, width), strict=True))
 
         def working(flow: Array, here: Array, there: Array) -> Array:
-            moved = has_moved(flow, here, there)[..., None]
+            moved = is_moving(flow, here, there)[..., None]
             return jnp.where(moved, flow, 0.0)[place][::stride, ::stride] / stride
 
         ways = working(forward[-1], *pictures), working(backward[-1], *pictures[::-1])
@@ -85,7 +85,7 @@ def network_flow(
     first = jnp.zeros_like(forward[:1])
     terms = jax.tree.map(jnp.mean, terms)
     flow = Flow(*(jnp.concatenate([first, way]) for way in (forward, backward)))
-    return flow, weighted(terms, settings), {f"flow/{name}": value for name, value in terms.items()}
+    return flow, total_loss(terms, settings), {f"flow/{name}": value for name, value in terms.items()}
 
 
 def _stride(frames: Frame) -> int:

@@ -69,7 +69,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
 
     That number is the mean box IoU on the held-out recordings if they are labelled, else the coherence of the held-out
     tags' reads with their masks' motion; NaN without any. `folder` then holds checkpoints, metrics.jsonl, what was
-    learned (weights.json, parameters.json, flow.npz), and where anything was held out metrics.json and report/. An
+    learned (weights.json, parameters.json, flow.safetensors), and where anything was held out metrics.json and report/. An
     interrupted run leaves a checkpoint, goes on from it when started again in the same folder, and returns NaN. Of
     several processes (`config.distributed`) the first writes and evaluates; the others return NaN.
     """
@@ -170,13 +170,13 @@ def _keep_learned(
 ) -> tuple[dict[str, AbstractTracer], dict[str, str]]:
     """Write what was learned; the learned tracer, that before the first step and the baselines; flows of their own.
 
-    Where a flow network was learned with it, each of the two sees with its own, kept as flow.npz and
-    flow_untrained.npz (flow_initial.npz, where it began from learned parameters).
+    Where a flow network was learned with it, each of the two sees with its own, kept as flow.safetensors and
+    flow_untrained.safetensors (flow_initial.safetensors, where it began from learned parameters).
     The learned parameters are kept as weights.json, and all tracers' as parameters.json.
     """
     before = "untrained" if config.weights is None else "initial"
     models = {"learned": state.model, before: make_model(config)}
-    files = {"learned": folder / "flow.npz", before: folder / f"flow_{before}.npz"}
+    files = {"learned": folder / "flow.safetensors", before: folder / f"flow_{before}.safetensors"}
     flows = {name: own_flow(model, config, files[name]) for name, model in models.items()}
     tracers = {name: model.tracer if isinstance(model, JointModel) else model for name, model in models.items()}
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..core.settings import ConfigError
 from ..recording import Recording, RecordingError
-from ..recording.opening import VirtualTagSettings, opened
+from ..recording.loading import VirtualTagSettings, open_recordings
 from ..tracing.clips import ClipSettings
 
 
@@ -34,7 +34,7 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
     twice = [path for path in data.recordings if _place(path) in held_out]
     if twice:
         raise RecordingError(f"{', '.join(sorted(twice))}: named both for training and for validation; hold it out.")
-    return opened(data.recordings, data.virtual_tag), opened(data.validation, data.virtual_tag)
+    return open_recordings(data.recordings, data.virtual_tag), open_recordings(data.validation, data.virtual_tag)
 
 
 def _place(path: str) -> str:

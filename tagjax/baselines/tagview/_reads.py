@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ...core.numerics import SPEED_OF_LIGHT_M_S
 from ...radio.channels import MAX_SLOPE_RAD_HZ, estimate_slope
-from ...radio.noise import pi_flip_share
+from ...radio.noise import estimate_flip_probability
 from ...recording import TagReads
 from ._hermite import interpolate
 from ._phase import pieces, splice_phase
@@ -125,7 +125,7 @@ def hear(
 def _has_flips(reads: TagReads, own, phase, time_s, channel) -> bool:
     if reads.pi_flips is not None:
         return bool(reads.pi_flips)
-    shares = [pi_flip_share(phase[index], time_s[index], channel[index]) for index in own]
+    shares = [estimate_flip_probability(phase[index], time_s[index], channel[index]) for index in own]
     known = [share for share in shares if np.isfinite(share)]
     return bool(known) and float(np.median(known)) > _FLIP_SHARE
 

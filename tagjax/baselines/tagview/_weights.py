@@ -1,4 +1,4 @@
-"""Weights of the detector as plain arrays: one .npz file, with the recipe that made them as JSON text in it."""
+"""Weights of the detector as plain arrays: one safetensors file, with the recipe that made them as JSON text in it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from ...core.arrays_file import ArraysFile
+from ...core.array_file import ArrayFile
 from ._network import BoxNetwork
 
 _WIDEST, _DEEPEST = 1024, 32
 
-PACKAGED = Path(__file__).parent / "detector.npz"
+PACKAGED = Path(__file__).parent / "detector.safetensors"
 """The weights that come with the package."""
 
-_FILE = ArraysFile(
+_FILE = ArrayFile(
     "tagjax-tagview-detector", 2, "weights of a Tagview detector", "python -m experiments.tagview command=train"
 )
 
@@ -36,7 +36,7 @@ def load_detector(path: str | Path | None = None) -> tuple[BoxNetwork, dict[str,
     Nothing in a file is executed. Raises `ValueError` for one that is missing, damaged or foreign.
     """
     path = PACKAGED if path is None else Path(path)
-    about = _FILE.about(path)
+    about = _FILE.metadata(path)
     said: Any = about.get("network")
     said = said if isinstance(said, Mapping) else {}
     widths, depth = said.get("widths"), said.get("depth")
@@ -48,7 +48,7 @@ def load_detector(path: str | Path | None = None) -> tuple[BoxNetwork, dict[str,
             f"depth of 1 to {_DEEPEST}). Train again, or copy the file again."
         )
     network = eqx.filter_eval_shape(lambda: BoxNetwork((widths[0], widths[1], widths[2]), depth, key=jax.random.key(0)))
-    return _FILE.fill(network, path), about
+    return _FILE.read(path, network), about
 
 
 def _within(value: Any, most: int) -> bool:

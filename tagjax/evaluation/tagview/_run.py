@@ -49,7 +49,7 @@ class DetectorTraining:
     """Which recordings the detector is trained and measured on, and how."""
 
     recipe: TrainSettings = dataclasses.field(default_factory=TrainSettings)
-    weights: str = "detector.npz"  # written there, within the run folder unless absolute
+    weights: str = "detector.safetensors"  # written there, within the run folder unless absolute
     measure_every: int = 4  # of the validation frames
 
 

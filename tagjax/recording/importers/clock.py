@@ -1,4 +1,4 @@
-"""Clock audit: was the reader's clock set, and how do reader and host clocks relate."""
+"""Clock audit: whether the reader's clock was set, and the offset and drift between the host's and the reader's clock."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ def reader_epoch(reader_ns: np.ndarray) -> str:
 
 
 def audit_clocks(reader_ns: np.ndarray, host_ns: np.ndarray) -> ClockAudit:
-    """Offset and drift of the host's clock against the reader's, from when reads were made and when they arrived.
+    """Offset and drift of the host's clock against the reader's, from the reader's read times and the host's arrival times.
 
-    Arrival is never before the read, and late by queues: in each of up to 60 stretches of time the earliest arrivals
-    count, and a line is fitted through them, outliers left out. The least latency stays in the offset.
+    Queues delay arrivals by varying amounts: the earliest arrival of each of up to 60 time intervals is used, and a line
+    is fitted to them without outliers. The minimum latency remains in the offset. Raises `RecordingError` for fewer than
+    two times, or different numbers of them.
     """
     if len(reader_ns) != len(host_ns) or len(reader_ns) < 2:
         raise RecordingError(f"{len(reader_ns)} reader and {len(host_ns)} host times; a clock audit needs two of each.")
@@ -59,7 +60,7 @@ def audit_clocks(reader_ns: np.ndarray, host_ns: np.ndarray) -> ClockAudit:
 
 
 def to_host_ns(reader_ns: np.ndarray, audit: ClockAudit) -> np.ndarray:
-    """Reader times on the host's clock: free of the jitter with which reads arrive."""
+    """Reader times on the host's clock, without the jitter of the arrival times."""
     first = int(np.min(reader_ns))
     drift = (reader_ns - first) * (audit.drift_ppm * 1e-6)
     return reader_ns + round(audit.offset_s * 1e9) + np.rint(drift).astype(np.int64)

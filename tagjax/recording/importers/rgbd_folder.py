@@ -1,4 +1,4 @@
-"""RGB-D folders: NNN.jpg beside NNN.mat with a calibration, and TUM RGB-D. Frames are decoded when they are asked for."""
+"""RGB-D folders: NNN.jpg beside NNN.mat with a calibration, and TUM RGB-D. Frames are decoded when indexed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import scipy.io
 from ...core.camera import Intrinsics
 from ...core.errors import RecordingError
 from ...core.geometry import register_depth, undistort
-from ..picture_files import in_order, read_colour, read_labels, read_picture
+from ..image_files import natural_sorted, read_colour, read_image, read_labels
 from ..reads import TagReads
 from ..recording import Recording, Truth
 
@@ -29,7 +29,7 @@ class DepthToColour:
     translation_m: np.ndarray
 
     def corrected(self, correction: Sequence[float]) -> DepthToColour:
-        """With a residual correction: (dTx, dTy, dTz) metres, factors on fx and fy, shifts of cx and cy in pixels."""
+        """The same cameras with a residual correction: (dTx, dTy, dTz) metres, factors on fx and fy, shifts of cx and cy in pixels."""
         dx, dy, dz, scale_x, scale_y, shift_x, shift_y = correction
         camera = self.colour_camera
         return dataclasses.replace(
@@ -46,7 +46,7 @@ class DepthToColour:
 
 
 class FrameFiles:
-    """Frames that are files, decoded by `decode(path)` when indexed: what Recording asks of an array."""
+    """Frames stored as files, decoded by `decode(path)` when indexed; usable as an array of a Recording."""
 
     def __init__(self, files: Sequence[Path], decode: Callable[[Path], np.ndarray], shape: tuple[int, ...], dtype: Any):
         self._files, self._decode = list(files), decode
@@ -66,7 +66,7 @@ class FrameFiles:
         path = self._files[int(index)]
         frame = self._decode(path)
         if frame.shape != self.shape[1:]:
-            raise RecordingError(f"{path}: a picture of shape {frame.shape}; expected {self.shape[1:]} as the others.")
+            raise RecordingError(f"{path}: an image of shape {frame.shape}; expected {self.shape[1:]} like the others.")
         return frame
 
 
@@ -83,31 +83,31 @@ def read_mat_depth(path: Path) -> np.ndarray:
 
 def _load_mat(path: str | Path, name: str) -> np.ndarray:
     try:
-        told = scipy.io.loadmat(path, variable_names=[name])
-    # A file that is cut short makes SciPy raise nearly anything (zlib.error, TypeError, struct.error, ...).
+        variables = scipy.io.loadmat(path, variable_names=[name])
+    # For a truncated file SciPy raises various errors (zlib.error, TypeError, struct.error, ...).
     except Exception as error:
         raise RecordingError(
             f"{path}: no readable MATLAB file ({type(error).__name__}: {error}). Copy it again; save it with -v7 if it is "
             "of version 7.3."
         ) from error
-    if name not in told:
-        raise RecordingError(f"{path}: no variable {name!r}. Was the copy cut short, or is this another file?")
-    return np.asarray(told[name])
+    if name not in variables:
+        raise RecordingError(f"{path}: no variable {name!r}; expected one. Copy the file again, or name another file.")
+    return np.asarray(variables[name])
 
 
 def load_calibration(path: str | Path, shape: tuple[int, int]) -> DepthToColour:
-    """Kdepth, Krgb, R, T of a `cam_params` structure; a translation in millimetres is turned into metres.
+    """Both cameras from Kdepth, Krgb, R, T of a `cam_params` structure; a T in millimetres is converted to metres.
 
-    Raises `RecordingError` for a file without them.
+    `shape` is (height, width) of the images. Raises `RecordingError` for a file without these values.
     """
-    told = _load_mat(path, "cam_params")
+    structure = _load_mat(path, "cam_params")
     try:
-        told = told[0, 0]
-        depth, colour, rotation = (np.asarray(told[name], float).reshape(3, 3) for name in ("Kdepth", "Krgb", "R"))
-        translation = np.asarray(told["T"], float).reshape(3)
+        values = structure[0, 0]
+        depth, colour, rotation = (np.asarray(values[name], float).reshape(3, 3) for name in ("Kdepth", "Krgb", "R"))
+        translation = np.asarray(values["T"], float).reshape(3)
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise RecordingError(
-            f"{path}: cam_params lacks something ({error}); expected Kdepth, Krgb and R, 3 x 3, and T, 3 numbers."
+            f"{path}: cam_params is incomplete ({error}); expected Kdepth, Krgb and R, 3 x 3, and T, 3 numbers."
         ) from error
     if np.linalg.norm(translation) > 1.0:
         translation = translation / 1000.0
@@ -130,25 +130,25 @@ def import_jpg_mat(
 ) -> Recording:
     """A folder of NNN.jpg with NNN.mat beside (depth camera's view, millimetres), registered to colour.
 
-    The folder has no times: frames are stamped at `fps`. `correction` is a residual correction of the calibration
-    (see `DepthToColour.corrected`), as `registration.estimate_correction` gives it. `masks` is a folder of label
-    pictures, one a frame. The recording has no tag reads. Raises `RecordingError` where pictures or their .mat files are
+    The folder has no times: frames get times at `fps`. `correction` is a residual correction of the calibration
+    (see `DepthToColour.corrected`), as `registration.estimate_correction` returns it. `masks` is a folder of label
+    images, one per frame. The recording has no tag reads. Raises `RecordingError` if images or their .mat files are
     missing or differ in size.
     """
     folder = Path(folder)
-    pictures = in_order(folder.glob("*.jpg"))
-    if not pictures:
-        raise RecordingError(f"{folder}: no .jpg file; expected pictures with .mat files of the same names.")
-    depths = [picture.with_suffix(".mat") for picture in pictures]
+    images = natural_sorted(folder.glob("*.jpg"))
+    if not images:
+        raise RecordingError(f"{folder}: no .jpg file; expected images with .mat files of the same names.")
+    depths = [picture.with_suffix(".mat") for picture in images]
     absent = [depth.name for depth in depths if not depth.is_file()]
     if absent:
         raise RecordingError(
-            f"{folder}: {len(absent)} of {len(pictures)} pictures have no depth beside them (no {', '.join(absent[:3])}"
-            f"{', ...' if len(absent) > 3 else ''}). Copy the missing files or remove those pictures."
+            f"{folder}: {len(absent)} of {len(images)} images have no depth file (no {', '.join(absent[:3])}"
+            f"{', ...' if len(absent) > 3 else ''}). Copy the missing files or remove those images."
         )
     if not np.isfinite(fps) or fps <= 0:
         raise RecordingError(f"fps is {fps}; expected a positive frame rate.")
-    first = read_colour(pictures[0])
+    first = read_colour(images[0])
     view = load_calibration(calibration, first.shape[:2])
     if correction is not None:
         view = view.corrected(correction)
@@ -157,7 +157,7 @@ def import_jpg_mat(
         depth = read_mat_depth(path)
         if depth.shape != first.shape[:2]:
             raise RecordingError(
-                f"{path}: depth of shape {depth.shape}; expected {first.shape[:2]} as the pictures, which the calibration is for."
+                f"{path}: depth of shape {depth.shape}; expected {first.shape[:2]} like the images, which the calibration is for."
             )
         metres = depth.astype(np.float32) * np.float32(1e-3)
         out = register_depth(metres, view.depth_camera, view.colour_camera, view.rotation, view.translation_m)
@@ -165,14 +165,14 @@ def import_jpg_mat(
 
     truth = None
     if masks is not None:
-        labels = in_order(Path(masks).glob("*.png"))
-        if len(labels) != len(pictures):
-            raise RecordingError(f"{masks}: {len(labels)} masks for {len(pictures)} pictures; expected one a picture.")
+        labels = natural_sorted(Path(masks).glob("*.png"))
+        if len(labels) != len(images):
+            raise RecordingError(f"{masks}: {len(labels)} masks for {len(images)} images; expected one per image.")
         truth = Truth(labels=FrameFiles(labels, read_labels, first.shape[:2], np.uint8))
     return Recording(
-        colour=FrameFiles(pictures, read_colour, first.shape, np.uint8),
+        colour=FrameFiles(images, read_colour, first.shape, np.uint8),
         depth=FrameFiles(depths, registered, first.shape[:2], np.uint16),
-        time_ns=np.rint(np.arange(len(pictures)) / fps * 1e9).astype(np.int64),
+        time_ns=np.rint(np.arange(len(images)) / fps * 1e9).astype(np.int64),
         intrinsics=view.colour_camera,
         reads=TagReads.empty(),
         truth=truth,
@@ -194,10 +194,11 @@ TUM_UNITS_PER_M = 5000.0
 
 
 def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: float = 0.02) -> Recording:
-    """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each picture with its nearest depth.
+    """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each image with the depth nearest in time.
 
-    The camera is told by the folder's name if not given; its lens distortion is undone frame by frame. Pictures without
-    depth within `max_gap_s` are left out, and how many is said in the recording's source. Raises `RecordingError`.
+    The camera follows from the folder's name if not given; lens distortion is removed frame by frame. Images without depth
+    within `max_gap_s` are left out; the recording's `source` states how many. Raises `RecordingError` for missing or
+    malformed files and an unknown camera.
     """
     folder = Path(folder)
     listings = {kind: _tum_listing(folder / f"{kind}.txt") for kind in ("rgb", "depth")}
@@ -216,34 +217,38 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
         else:
             dropped += 1
     if not pairs:
-        raise RecordingError(f"{folder}: no picture has a depth map within {max_gap_s} s. Are both lists of one clock?")
+        raise RecordingError(
+            f"{folder}: no image has a depth map within {max_gap_s} s; expected both lists on the same clock."
+        )
     absent = [path for _, *both in pairs for path in both if not path.is_file()]
     if absent:
         raise RecordingError(f"{folder}: {len(absent)} listed files are missing, first {absent[0]}. Copy them again.")
     shape = read_colour(pairs[0][1]).shape
     if shape[:2] != TUM_SHAPE:
         raise RecordingError(
-            f"{pairs[0][1]}: a picture of {shape[:2]}; expected {TUM_SHAPE}, which TUM's intrinsics are for."
+            f"{pairs[0][1]}: an image of {shape[:2]}; expected {TUM_SHAPE}, which TUM's intrinsics are for."
         )
     fx, fy, cx, cy, distortion = TUM_INTRINSICS[chosen]
     lens = Intrinsics(fx, fy, cx, cy, shape[1], shape[0], distortion)
 
     def colour(path: Path) -> np.ndarray:
         picture = read_colour(path)
-        if not distortion or picture.shape != shape:  # another shape is refused with the file's name
+        if not distortion or picture.shape != shape:  # FrameFiles refuses another shape, with the file's name
             return picture
         return undistort(picture, np.zeros(shape[:2], np.float32), lens)[0]
 
     def depth_mm(path: Path) -> np.ndarray:
-        raw = read_picture(path, cv2.IMREAD_UNCHANGED)
+        raw = read_image(path, cv2.IMREAD_UNCHANGED)
         if raw.dtype != np.uint16 or raw.ndim != 2:
-            raise RecordingError(f"{path}: {raw.dtype} of shape {raw.shape}; expected a 16-bit grey depth picture.")
+            raise RecordingError(
+                f"{path}: {raw.dtype} of shape {raw.shape}; expected a 16-bit grey depth image. Convert it."
+            )
         depth = np.rint(raw * (1000.0 / TUM_UNITS_PER_M)).astype(np.float32)
         if distortion and depth.shape == shape[:2]:
             depth = undistort(np.zeros(shape, np.uint8), depth, lens)[1]
         return depth.astype(np.uint16)
 
-    undone = f"; lens distortion of {chosen} undone" if distortion else ""
+    removed = f"; lens distortion of {chosen} removed" if distortion else ""
     return Recording(
         colour=FrameFiles([p for _, p, _ in pairs], colour, shape, np.uint8),
         depth=FrameFiles([d for _, _, d in pairs], depth_mm, shape[:2], np.uint16),
@@ -251,23 +256,23 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
         intrinsics=dataclasses.replace(lens, distortion=()),
         reads=TagReads.empty(),
         name=folder.name,
-        source=f"TUM RGB-D {folder.name}; {dropped} of {len(listings['rgb'])} pictures without depth left out{undone}",
+        source=f"TUM RGB-D {folder.name}; {dropped} of {len(listings['rgb'])} images without depth left out{removed}",
     )
 
 
 def _tum_listing(path: Path) -> list[tuple[float, Path]]:
     if not path.is_file():
-        raise RecordingError(f"{path}: missing; a TUM RGB-D folder lists its pictures there.")
+        raise RecordingError(f"{path}: missing; a TUM RGB-D folder lists its images there.")
     rows = []
     for number, line in enumerate(path.read_text().splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
             continue
         try:
-            stamp, name = float(words[0]), words[1]
+            stamp, name = float(fields[0]), fields[1]
         except (ValueError, IndexError) as error:
             raise RecordingError(f"{path}, line {number}: {line!r}; expected a time and a file name.") from error
         rows.append((stamp, path.parent / name))
     if not rows:
-        raise RecordingError(f"{path}: lists no picture.")
+        raise RecordingError(f"{path}: lists no image.")
     return rows

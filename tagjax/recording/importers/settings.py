@@ -1,4 +1,4 @@
-"""What `experiments.import_recording` can be told, and the import itself."""
+"""Settings of `experiments.import_recording`, and the import itself."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from .tables import ImportReport, import_table
 
 @dataclasses.dataclass(frozen=True)
 class ImportSettings:
-    """A video, a table of reads, or both; and where the recording goes."""
+    """A video, a table of reads, or both; and the folder of the new recording."""
 
     video: str | None = None
     video_format: str = "auto"  # tum | jpg_mat | auto
     calibration: str | None = None  # jpg_mat: .mat with cam_params
     correction: Any = None  # jpg_mat: residual correction of the calibration: null | 7 numbers | estimate
     masks: str | None = None  # jpg_mat: folder of label pictures
-    fps: float = 30.0  # jpg_mat: its folder holds no times
+    fps: float = 30.0  # jpg_mat: frame rate, since the folder has no times
     reads: str | None = None
     format: str = "auto"
     hop_table_hz: tuple[float, ...] | None = None
@@ -42,16 +42,16 @@ class ImportSettings:
 
 
 def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[str]]:
-    """Import what `settings` name; the recording (None for a table alone) and what is to be said of it.
+    """Import the data that `settings` name; returns the recording (None for a table alone) and a report, line by line.
 
-    The recording is checked and, if `out` is given, saved. Raises `RecordingError`.
+    The recording is checked and, if `out` is given, saved. Raises `RecordingError` for data that cannot be imported.
     """
     if settings.video is None and settings.reads is None:
         raise RecordingError("Nothing to import: give video=<folder>, reads=<table>, or both.")
-    said: list[str] = []
+    report: list[str] = []
     table = None
     if settings.reads is not None:
-        reads, audit, report = import_table(
+        reads, audit, table_report = import_table(
             settings.reads,
             format=settings.format,
             hop_table_hz=settings.hop_table_hz,
@@ -59,29 +59,29 @@ def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[s
             clock=settings.clock,
         )
         table = (reads, audit)
-        said += _table_lines(report, reads)
+        report += _table_lines(table_report, reads)
     if settings.video is None:
-        return None, said
-    recording = _video(settings, said)
+        return None, report
+    recording = _video(settings, report)
     recording = dataclasses.replace(recording, antennas_m=np.asarray(settings.antennas_m, float))
     if table is not None:
         recording = dataclasses.replace(recording, reads=table[0], clock=table[1])
     if settings.tracks is not None:
         tracks = load_tracks_csv(settings.tracks, recording.frame_time_s())
         recording = attach_virtual_tags(recording, tracks, settings.reader, seed=settings.seed)
-        said.append(f"virtual tags on {len(tracks)} tracks, {recording.reads.num_reads} reads")
+        report.append(f"virtual tags on {len(tracks)} tracks, {recording.reads.num_reads} reads")
     recording.check()
-    said.append(
+    report.append(
         f"{recording.num_frames} frames of {recording.intrinsics.width} x {recording.intrinsics.height}, "
         f"{recording.frame_rate_hz:.1f} frames/s; {recording.source}"
     )
     if settings.out is not None:
         save_recording(recording, settings.out, progress=True)
-        said.append(f"saved as {settings.out}")
-    return recording, said
+        report.append(f"saved as {settings.out}")
+    return recording, report
 
 
-def _video(settings: ImportSettings, said: list[str]) -> Recording:
+def _video(settings: ImportSettings, report: list[str]) -> Recording:
     assert settings.video is not None
     folder = Path(settings.video)
     if not folder.is_dir():
@@ -103,16 +103,16 @@ def _video(settings: ImportSettings, said: list[str]) -> Recording:
         return plain
     if given == "estimate":
         found = estimate_folder_correction(folder, settings.calibration)
-        said.append(found.line())
-        correction, how = found.correction, "estimated"
+        report.append(found.line())
+        correction, origin = found.correction, "estimated"
     else:
-        correction, how = given, "given"
+        correction, origin = given, "given"
     corrected = import_jpg_mat(
         folder, settings.calibration, fps=settings.fps, correction=correction, masks=settings.masks
     )
-    # Told in full, so that the same recording can be made again without estimating.
+    # The numbers in full, so that the same recording can be imported again without an estimate.
     numbers = ", ".join(f"{value:.8g}" for value in correction)
-    return dataclasses.replace(corrected, source=f"{corrected.source}; correction = [{numbers}] ({how})")
+    return dataclasses.replace(corrected, source=f"{corrected.source}; correction = [{numbers}] ({origin})")
 
 
 def _correction(value: Any) -> Literal["estimate"] | tuple[float, ...] | None:

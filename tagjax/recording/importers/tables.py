@@ -1,4 +1,4 @@
-"""RFID tables to tag reads: the format is recognised, every rejected row is counted and said."""
+"""Import of RFID tables as tag reads: the format is recognised, and rejected rows are counted and reported."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .clock import audit_clocks, reader_epoch, to_host_ns
 from .formats import FORMATS, Format, Read, RowError, recognise
 
 MAX_REJECTED = 0.5
-"""A table of which more is rejected is taken for one of another format."""
+"""A table of which a larger fraction of rows is rejected is taken for another format."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """What an import found: rows taken and rejected, by reason, and what was done about it."""
+    """Result of an import: numbers of rows and reads, rejected rows by reason, and notes about corrections."""
 
     format: str
     num_rows: int
@@ -47,16 +47,16 @@ def import_table(
     clock: Literal["auto", "reader", "arrival"] | float = "auto",
     synthetic_rate_hz: float = 50.0,
 ) -> tuple[TagReads, ClockAudit | None, ImportReport]:
-    """Read an RFID table: `TagReads` in order of host time, a clock audit where both clocks are there, and a report.
+    """Read an RFID table: `TagReads` in order of host time, a clock audit if the table has both clocks, and a report.
 
     Args:
         path: the table.
-        format: a name in `FORMATS`, or "auto" to tell by the header.
+        format: a name in `FORMATS`, or "auto" to recognise the header.
         hop_table_hz: carriers of channel index 1, 2, ... (readers number their own, shuffled hop table).
         carrier_hz: the one carrier of a reader that does not hop.
         clock: "reader" uses the reader's clock as it is, "arrival" the host's; a number of seconds is added to the
-            reader's; "auto" moves reader times onto the host's clock by an audit where both are there.
-        synthetic_rate_hz: rows of a table without times are stamped in order, each tag at this rate.
+            reader's; "auto" converts reader times to the host's clock by an audit if the table has both.
+        synthetic_rate_hz: rows of a table without times get times in order, each tag at this rate.
 
     Raises `RecordingError` if no format fits, phases are absent, or more than half of the rows are rejected.
     """
@@ -67,7 +67,7 @@ def import_table(
     chosen = _choose(path, lines, format)
     if chosen.name == "sllurp_log":
         raise RecordingError(
-            f"{path}: a sllurp log without phases. Enable phase reports (impinj_tag_content_selector: "
+            f"{path}: a sllurp log without phases; expected phase reports. Enable them (impinj_tag_content_selector: "
             "EnableRFPhaseAngle) and record again."
         )
     rejected: collections.Counter[str] = collections.Counter()
@@ -76,7 +76,7 @@ def import_table(
     for row in chosen.rows(lines):
         num_rows += 1
         try:
-            reads.append(_taken(chosen.read(row)))
+            reads.append(_checked(chosen.read(row)))
         except RowError as error:
             rejected[str(error)] += 1
         except (KeyError, TypeError, AttributeError):
@@ -84,8 +84,8 @@ def import_table(
     if num_rows == 0 or len(reads) < (1 - MAX_REJECTED) * num_rows:
         reasons = "; ".join(f"{count} times: {reason}" for reason, count in rejected.most_common(3)) or "no row"
         raise RecordingError(
-            f"{path}: {num_rows - len(reads)} of {num_rows} rows are no {chosen.name} reads ({reasons}). Wrong format or "
-            "units? Set format= to one of " + ", ".join(FORMATS) + "."
+            f"{path}: {num_rows - len(reads)} of {num_rows} rows are not valid {chosen.name} reads ({reasons}). Check format and "
+            "units; set format= to one of " + ", ".join(FORMATS) + "."
         )
     notes: list[str] = []
     host_ns, reader_ns, audit = _times(reads, clock, synthetic_rate_hz, notes)
@@ -107,7 +107,7 @@ def import_table(
     if back:
         notes.append(f"{back} reads were out of order of time and have been sorted")
     table = table[order]
-    twice = np.concatenate(
+    repeated = np.concatenate(
         [
             [False],
             (np.diff(table.time_ns) == 0)
@@ -116,9 +116,9 @@ def import_table(
             & (table.phase_rad[1:] == table.phase_rad[:-1]),
         ]
     )
-    if twice.any():
-        rejected["repeats the read before it"] = int(twice.sum())
-        table = table[~twice]
+    if repeated.any():
+        rejected["repeats the read before it"] = int(repeated.sum())
+        table = table[~repeated]
     return table, audit, ImportReport(chosen.name, num_rows, table.num_reads, dict(rejected), tuple(notes))
 
 
@@ -131,12 +131,12 @@ def _choose(path: Path, lines: list[str], name: str) -> Format:
     if found is None:
         head = lines[0][:120] if lines else "nothing"
         raise RecordingError(
-            f"{path}: no known header (first line: {head!r}). Known formats: {', '.join(FORMATS)}; set format= if it is one."
+            f"{path}: found no known header (first line: {head!r}). Known formats: {', '.join(FORMATS)}; set format= if it is one."
         )
     return found
 
 
-def _taken(read: Read) -> Read:
+def _checked(read: Read) -> Read:
     if read.phase_rad is None:
         raise RowError("phase is absent")
     if read.antenna < 1:
@@ -157,34 +157,34 @@ def _times(
 
     reader, host = column("reader_ns"), column("host_ns")
     if reader is None and host is None:
-        seen: collections.Counter[str] = collections.Counter()
+        counts: collections.Counter[str] = collections.Counter()
         stamps = []
         for read in reads:
-            stamps.append(round(seen[read.epc] / rate_hz * 1e9))
-            seen[read.epc] += 1
+            stamps.append(round(counts[read.epc] / rate_hz * 1e9))
+            counts[read.epc] += 1
         warnings.warn(
-            f"The table holds no times: reads are stamped in order, {rate_hz:g} a second and tag.",
+            f"The table has no times: reads get times in order, {rate_hz:g} a second for each tag.",
             RecordingWarning,
             stacklevel=4,
         )
-        notes.append(f"no times in the table: stamped in order at {rate_hz:g} reads/s a tag")
+        notes.append(f"no times in the table: set in order at {rate_hz:g} reads/s per tag")
         return np.array(stamps, np.int64), None, None
     audit = audit_clocks(reader, host) if reader is not None and host is not None and len(reads) > 1 else None
     if reader is not None and reader_epoch(reader) != "unix":
-        told = f"the reader's clock was never set: it started in {reader_epoch(reader)}"
-        warnings.warn(told[0].upper() + told[1:] + ".", RecordingWarning, stacklevel=4)
-        notes.append(told)
+        note = f"the reader's clock was never set: it started in {reader_epoch(reader)}"
+        warnings.warn(note[0].upper() + note[1:] + ".", RecordingWarning, stacklevel=4)
+        notes.append(note)
     if isinstance(clock, int | float) and not isinstance(clock, bool):
         if reader is None:
             raise RecordingError(f"clock={clock}: an offset is added to the reader's clock, which this table lacks.")
         return reader + round(clock * 1e9), reader, audit
     if clock == "arrival" or reader is None:
         if host is None:
-            raise RecordingError("clock=arrival: the table holds no arrival times. Use clock=reader or an offset.")
+            raise RecordingError("clock=arrival: the table has no arrival times. Use clock=reader or an offset.")
         return host, reader, audit
     if clock == "auto" and audit is not None:
         notes.append(
-            f"reader times moved onto the host's clock: offset {audit.offset_s:.3f} s, drift {audit.drift_ppm:.1f} ppm, "
+            f"reader times converted to the host's clock: offset {audit.offset_s:.3f} s, drift {audit.drift_ppm:.1f} ppm, "
             f"residual {audit.residual_ms:.2f} ms"
         )
         return to_host_ns(reader, audit), reader, audit
@@ -208,7 +208,7 @@ def _carriers(
     elif unknown.any() and carrier_hz is not None:
         carrier = np.where(unknown, carrier_hz, carrier)
     elif unknown.any():
-        told = "carriers are unknown: give the reader's own hop table (hop_table_hz) or its one carrier (carrier_hz)"
-        warnings.warn(told[0].upper() + told[1:] + ".", RecordingWarning, stacklevel=4)
-        notes.append(told)
+        note = "carriers are unknown: give the reader's own hop table (hop_table_hz) or its one carrier (carrier_hz)"
+        warnings.warn(note[0].upper() + note[1:] + ".", RecordingWarning, stacklevel=4)
+        notes.append(note)
     return carrier, index

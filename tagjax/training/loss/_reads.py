@@ -112,7 +112,11 @@ def _agreement_of_antenna(
         residual, channel = (jnp.broadcast_to(part, weight.shape) for part in (residual, one.channel))
         if evidence == "likelihood":
             return phase_likelihood(
-                residual, weight, channel, num_channels=settings.num_channels, flip_share=settings.flip_probability
+                residual,
+                weight,
+                channel,
+                num_channels=settings.num_channels,
+                flip_probability=settings.flip_probability,
             )
         return coherence(residual, weight, channel, num_channels=settings.num_channels, multiple=multiple)
 

@@ -1,7 +1,7 @@
-"""An exact Bayes filter for phase reads on a grid over (distance modulo half a wavelength) x (radial velocity).
+"""A grid-based Bayes filter for phase reads, on (distance modulo half a wavelength) x (radial velocity).
 
-The state lives on a circle, so nothing is ever unwrapped: pi flips, outliers and gaps are alternatives that the
-filter keeps open until later reads decide. The unwrapped path follows from the filter's own prediction.
+Distance is a state on a circle, so phases are not unwrapped: pi flips, outliers and gaps are hypotheses that the filter
+keeps until later reads decide. The unwrapped distance follows from the filter's prediction.
 """
 
 from __future__ import annotations
@@ -17,11 +17,16 @@ from .reads import PhaseReads
 
 
 class RadioModel(eqx.Module):
-    """What the robust estimator assumes. Arrays are differentiable; the grid is static."""
+    """Parameters of the robust estimator. Arrays are differentiable; the grid is static.
+
+    `multipath_rad` is the standard deviation of the multipath ripple, added to thermal noise; `flip_probability` and
+    `outlier_probability` are per read; `velocity_walk_m2_s3` is the variance of the velocity's random walk per second;
+    `slope_rad_hz` and `hop_rad` are slope and residual of the channels' phase offsets (`estimate_slope`).
+    """
 
     multipath_rad: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.15)
-    flip_share: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.05)
-    outlier_share: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.02)
+    flip_probability: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.05)
+    outlier_probability: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.02)
     velocity_walk_m2_s3: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=2.0)
     acceleration_m_s2: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=3.0)
     slope_rad_hz: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.0)
@@ -32,7 +37,7 @@ class RadioModel(eqx.Module):
 
 
 class FilteredPath(eqx.Module):
-    """The filter's unwrapped path after every read."""
+    """The filter's unwrapped distance, and velocity with its standard deviation, after every read."""
 
     distance_m: Float[Array, " reads"]
     velocity_m_s: Float[Array, " reads"]
@@ -40,22 +45,24 @@ class FilteredPath(eqx.Module):
 
 
 def reference_carrier(reads: PhaseReads) -> Float[Array, ""]:
-    """Mean carrier of the valid reads, Hz: what the circle of the filter is measured with."""
+    """Mean carrier of the valid reads, Hz, which sets the filter's half wavelength; 915 MHz without reads."""
     weight = reads.valid.astype(reads.carrier_hz.dtype)
     mean = jnp.sum(weight * reads.carrier_hz) / jnp.maximum(jnp.sum(weight), 1.0)
     return jnp.where(jnp.sum(weight) > 0, mean, 915e6)
 
 
-def level_phase(reads: PhaseReads, model: RadioModel, reference_hz: Float[Array, ""]) -> Float[Array, " reads"]:
-    """Phases with the affine channel offset slope * (f - f_reference) taken out."""
+def remove_channel_slope(
+    reads: PhaseReads, model: RadioModel, reference_hz: Float[Array, ""]
+) -> Float[Array, " reads"]:
+    """Phases minus the affine channel offset slope * (f - f_reference), radians."""
     return reads.phase_rad - model.slope_rad_hz * (reads.carrier_hz - reference_hz)
 
 
 def _fourier(size: int) -> tuple[np.ndarray, np.ndarray]:
     """The real Fourier transform of `size` values, cosine parts before sine parts, and its inverse, as matrices.
 
-    At this size products take no longer than a fast transform, which in a loop on few cores can wait for ever: XLA's (jaxlib
-    0.10) waits on a thread of the pool that its own threads come from.
+    At this size matrix products take no longer than an FFT, and XLA's FFT (jaxlib 0.10) can deadlock in a loop on few
+    cores: it waits for a thread of the pool that runs it.
     """
     forward = np.fft.rfft(np.eye(size), axis=0)
     back = np.fft.irfft(np.concatenate([np.eye(len(forward)), -1j * np.eye(len(forward))], axis=1), size, axis=0)
@@ -63,12 +70,12 @@ def _fourier(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
-    """Run the filter over reads in order of time; invalid reads repeat the value before them.
+    """Run the filter over reads in order of time; at an invalid read the previous values are repeated.
 
     Likelihood of a read: von Mises around the predicted phase with the read's thermal noise and the multipath ripple,
-    a share of it turned by pi, a share of it anywhere. Between reads the circle turns by 4 pi f v dt / c (exactly, in
-    the Fourier domain) and velocity diffuses (exactly, in the cosine basis of the grid). At a channel change the
-    circle is blurred by what the affine offset model leaves open.
+    with probabilities of a pi flip and of an outlier (uniform). Between reads the phase advances by 4 pi f v dt / c
+    (exactly, in the Fourier domain) and velocity diffuses (exactly, in the cosine basis of the grid). At a channel change
+    the phase is blurred by `hop_rad`, the residual of the affine offset model.
     """
     num_phases, num_velocities = model.num_phases, model.num_velocities
     dtype = reads.time_s.dtype
@@ -85,7 +92,7 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
     decay = jnp.asarray(2.0 - 2.0 * np.cos(np.pi * k / num_velocities), dtype) / spacing**2
     reference = reference_carrier(reads)
     wavenumber = 4 * jnp.pi * reference / SPEED_OF_LIGHT_M_S
-    phase = level_phase(reads, model, reference)
+    phase = remove_channel_slope(reads, model, reference)
     kappa = 1.0 / (jnp.square(reads.sigma_rad) + model.multipath_rad**2)
 
     def advance(carry, read):
@@ -102,20 +109,20 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
         predicted = jnp.maximum(((predicted @ basis.T) * spread[None, :]) @ basis, 0.0) + 1e-9
         mean_velocity = jnp.sum(predicted * velocity[None, :]) / jnp.sum(predicted)
         ahead = distance + mean_velocity * gap
-        # The affine offset holds at the first distance; what the tag moved since tilts it by 4 pi (f - f0) x / c.
+        # The affine offset is that at the first distance; the distance moved since adds 4 pi (f - f0) x / c.
         level = angle - (4 * jnp.pi / SPEED_OF_LIGHT_M_S) * (carrier - reference) * ahead
         away = level - theta
         bump = jnp.exp(concentration * (jnp.cos(away) - 1.0))
         flipped = jnp.exp(concentration * (-jnp.cos(away) - 1.0))
         norm = jnp.sqrt(concentration / (2 * jnp.pi))
-        likelihood = (1 - model.outlier_share) * norm * (
-            (1 - model.flip_share) * bump + model.flip_share * flipped
-        ) + model.outlier_share / (2 * jnp.pi)
+        likelihood = (1 - model.outlier_probability) * norm * (
+            (1 - model.flip_probability) * bump + model.flip_probability * flipped
+        ) + model.outlier_probability / (2 * jnp.pi)
         posterior = predicted * likelihood[:, None]
         posterior = posterior / jnp.sum(posterior)
         marginal = jnp.sum(posterior, axis=1)
         centre = safe_atan2(jnp.sum(marginal * jnp.sin(theta)), jnp.sum(marginal * jnp.cos(theta)))
-        # The first read sets the zero: the circle then reads 4 pi f x / c directly.
+        # The first read sets the origin: the phase is then 4 pi f x / c.
         aligned = jnp.where(started, ahead + wrap_to_pi(centre - wavenumber * ahead) / wavenumber, centre / wavenumber)
         mean = jnp.sum(posterior * velocity[None, :])
         std = jnp.sqrt(jnp.sum(posterior * jnp.square(velocity - mean)[None, :]) + 1e-9)

@@ -1,6 +1,6 @@
-"""A recording played backwards, for a pass that begins at the end.
+"""Time-reversed recordings, for the backward pass of offline smoothing.
 
-A tag's phase is the same whichever way time runs, so the reads keep theirs; a Doppler shift turns round.
+A tag's phase depends on its distance only, so reads keep their phase; a Doppler shift changes its sign.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from .reads import TagReads
 from .recording import Recording, Truth
 
 
-class _Backwards:
-    """Frames in the opposite order, read when indexed."""
+class _ReversedFrames:
+    """Frames in reverse order, read when indexed."""
 
     def __init__(self, frames: LazyArray):
         self._frames = frames
@@ -34,7 +34,7 @@ class _Backwards:
         if isinstance(index, slice):
             first, stop, step = index.indices(len(self))
             if step != 1:
-                raise IndexError(f"Frames {index} of a recording played backwards; expected neighbouring ones.")
+                raise IndexError(f"Frames {index} of a time-reversed recording; expected a slice of step 1.")
             stop = max(first, stop)
             return np.asarray(self._frames[last + 1 - stop : last + 1 - first])[::-1]
         frame = int(index)
@@ -43,29 +43,29 @@ class _Backwards:
         return np.asarray(self._frames[last - frame % len(self)])
 
 
-def _turned_reads(reads: TagReads, first_ns: int, last_ns: int) -> TagReads:
-    back = reads[::-1]
+def _reversed_reads(reads: TagReads, first_ns: int, last_ns: int) -> TagReads:
+    reverse = reads[::-1]
     return dataclasses.replace(
-        back,
-        time_ns=first_ns + last_ns - back.time_ns,
-        doppler_hz=-back.doppler_hz,
-        reader_time_ns=None if back.reader_time_ns is None else -back.reader_time_ns,
+        reverse,
+        time_ns=first_ns + last_ns - reverse.time_ns,
+        doppler_hz=-reverse.doppler_hz,
+        reader_time_ns=None if reverse.reader_time_ns is None else -reverse.reader_time_ns,
     )
 
 
-def played_backwards(recording: Recording) -> Recording:
-    """The recording with its last frame first, between the same two times. Of its truth the tags' ranges come along."""
+def time_reversed(recording: Recording) -> Recording:
+    """The recording with its last frame first, between the same two times. Of the truth only the tags' ranges are kept."""
     first_ns, last_ns = int(recording.time_ns[0]), int(recording.time_ns[-1])
     truth = recording.truth
     ranges = {} if truth is None else {epc: np.asarray(known)[::-1] for epc, known in truth.tag_range_m.items()}
     return dataclasses.replace(
         recording,
-        colour=_Backwards(recording.colour),
-        depth=_Backwards(recording.depth),
+        colour=_ReversedFrames(recording.colour),
+        depth=_ReversedFrames(recording.depth),
         time_ns=first_ns + last_ns - recording.time_ns[::-1],
-        reads=_turned_reads(recording.reads, first_ns, last_ns),
+        reads=_reversed_reads(recording.reads, first_ns, last_ns),
         truth=Truth(tag_range_m=ranges) if ranges else None,
         clock=None,
         store=None,
-        forwards=recording,
+        reversed_from=recording,
     )

@@ -1,8 +1,7 @@
-"""Arrays that are made once: by one of several, gone on with after Ctrl-C or a kill, and never half taken for whole."""
+"""Cached arrays: computed by one of several processes, resumed after Ctrl-C or a kill, never read incomplete."""
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -15,8 +14,7 @@ import numpy as np
 import pytest
 import zarr
 
-from tagjax.core import prepared
-from tagjax.core.prepared import made_once, write_rows
+from tagjax.core.array_cache import cached_array, write_rows
 from tagjax.core.types import LazyArray
 
 SHAPE, SHARD, BLOCK = (11, 3, 2), 4, 2
@@ -56,16 +54,16 @@ def test_what_was_finished_before_an_interruption_is_not_made_again(tmp_path: Pa
     target, begun = tmp_path / "new" / "a.zarr", []
     for row in (6, 10):  # in the second file, and in the third
         with pytest.raises(error):
-            made_once(target, make(begun, stop_at(row, error)))
+            cached_array(target, make(begun, stop_at(row, error)))
         assert not target.exists()
-    whole(made_once(target, make(begun)), target.parent)
-    whole(made_once(target, make(begun)), target.parent)
+    whole(cached_array(target, make(begun)), target.parent)
+    whole(cached_array(target, make(begun)), target.parent)
     assert begun == [0, 4, 8]
 
 
 def test_an_interruption_before_anything_was_finished_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        made_once(tmp_path / "a.zarr", make([], stop_at(2)))
+        cached_array(tmp_path / "a.zarr", make([], stop_at(2)))
     assert not list(tmp_path.iterdir())
 
     def broken(path: Path) -> None:
@@ -73,42 +71,42 @@ def test_an_interruption_before_anything_was_finished_leaves_nothing(tmp_path: P
         raise ValueError("no more")
 
     with pytest.raises(ValueError, match="no more"):
-        made_once(tmp_path / "a.zarr", broken)
+        cached_array(tmp_path / "a.zarr", broken)
     assert not list(tmp_path.iterdir())
     with pytest.raises(ValueError, match="11 rows for an array of 12"):
-        made_once(tmp_path / "a.zarr", make([], shape=(12, 3, 2)))
+        cached_array(tmp_path / "a.zarr", make([], shape=(12, 3, 2)))
 
 
 @pytest.mark.parametrize("damage", ["half", "mark", "shape", "array", "unmarked"])
 def test_what_cannot_be_gone_on_with_is_made_again(tmp_path: Path, damage: str) -> None:
     target, begun = tmp_path / "a.zarr", []
     with pytest.raises(KeyboardInterrupt):
-        made_once(target, make(begun, stop_at(10)))
+        cached_array(target, make(begun, stop_at(10)))
     place = tmp_path / ".a.zarr.partial"
     more = {}
     if damage == "half":  # of a file that was being written
-        part = place / "made" / "c" / "2" / "0" / "0"
+        part = place / "array" / "c" / "2" / "0" / "0"
         part.parent.mkdir(parents=True)
         part.write_bytes(b"half")
     elif damage == "mark":
-        (place / "done").write_text("")
+        (place / "num_rows").write_text("")
     elif damage == "shape":  # of a release that cuts files otherwise
         more = {"shard": 6}
     elif damage == "array":
-        (place / "made" / "zarr.json").unlink()
+        (place / "array" / "zarr.json").unlink()
     else:
-        (place / "done").unlink()
-    whole(made_once(target, make(begun, **more)), tmp_path)
+        (place / "num_rows").unlink()
+    whole(cached_array(target, make(begun, **more)), tmp_path)
     assert begun == [0, 8 if damage == "half" else 0]
 
 
 def start_maker(target: Path) -> subprocess.Popen:
     """Another process that makes the array, and hangs when it has finished two of its files."""
     code = (
-        "import sys, time; from pathlib import Path; sys.path.insert(0, 'tests'); import test_prepared as t\n"
+        "import sys, time; from pathlib import Path; sys.path.insert(0, 'tests'); import test_array_cache as t\n"
         "def stop(row):\n"
         "    if row == 10: print('there', flush=True); time.sleep(600)\n"
-        "t.made_once(Path(sys.argv[1]), t.make([], stop))"
+        "t.cached_array(Path(sys.argv[1]), t.make([], stop))"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(target)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -121,10 +119,10 @@ def test_a_second_maker_waits_and_goes_on_where_the_first_was_killed(
 ) -> None:
     target, begun, found = tmp_path / "a.zarr", [], []
     with start_maker(target) as first:
-        second = threading.Thread(target=lambda: found.append(made_once(target, make(begun))))
+        second = threading.Thread(target=lambda: found.append(cached_array(target, make(begun))))
         second.start()
         said = ""
-        while "another process is at work there" not in said:
+        while "another process computes a.zarr" not in said:
             time.sleep(0.01)
             said += capfd.readouterr().err
         time.sleep(0.2)
@@ -140,7 +138,7 @@ def test_of_many_makers_one_makes(tmp_path: Path) -> None:
     target, begun, found = tmp_path / "a.zarr", [], []
 
     def run() -> None:
-        found.append(made_once(target, make(begun, lambda row: time.sleep(0.01))))
+        found.append(cached_array(target, make(begun, lambda row: time.sleep(0.01))))
 
     threads = [threading.Thread(target=run) for _ in range(8)]
     for thread in threads:
@@ -152,25 +150,8 @@ def test_of_many_makers_one_makes(tmp_path: Path) -> None:
     whole(found[-1], tmp_path)
 
 
-def test_a_folder_that_is_removed_while_another_maker_asks_for_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun, asked, make_folder = [], [], os.mkdir
-
-    def overtaken(path: str | Path, mode: int = 0o777) -> None:
-        if str(path).endswith(".partial") and not asked:
-            asked.append(path)
-            raise FileExistsError
-        make_folder(path, mode)
-
-    monkeypatch.setattr(os, "mkdir", overtaken)
-    whole(made_once(tmp_path / "a.zarr", make(begun)), tmp_path)
-    assert asked
-    assert begun == [0]
-
-
 def test_makers_that_fail_and_makers_that_wait_do_not_disturb_each_other(tmp_path: Path) -> None:
-    """Each failure takes the folder away from under those that wait for it."""
+    """Each failure removes the lock file that the others wait for."""
     target, begun = tmp_path / "a.zarr", []
     left = [12]
 
@@ -182,7 +163,7 @@ def test_makers_that_fail_and_makers_that_wait_do_not_disturb_each_other(tmp_pat
 
         while True:
             try:
-                return whole(made_once(target, make(begun, stop)), tmp_path)
+                return whole(cached_array(target, make(begun, stop)), tmp_path)
             except RuntimeError:
                 continue
             except AssertionError:  # one that waited is about to leave
@@ -196,39 +177,3 @@ def test_makers_that_fail_and_makers_that_wait_do_not_disturb_each_other(tmp_pat
     assert not any(thread.is_alive() for thread in threads)
     assert begun == [0] * 13
     whole(zarr.open_array(str(target), mode="r"), tmp_path)
-
-
-@pytest.mark.parametrize("missing", ["module", "support"])
-def test_without_locks_each_makes_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
-    if missing == "module":
-        monkeypatch.setattr(prepared, "fcntl", None)
-    else:
-
-        def refuse(*arguments) -> None:
-            raise OSError(38, "Function not implemented")
-
-        monkeypatch.setattr(prepared.fcntl, "flock", refuse)
-    target, begun = tmp_path / "a.zarr", []
-    with pytest.raises(KeyboardInterrupt):
-        made_once(target, make(begun, stop_at(10)))
-    assert not list(tmp_path.iterdir())
-
-    def overtaken(row: int) -> None:
-        if row == 6:
-            made_once(target, make(begun))
-
-    whole(made_once(target, make(begun, overtaken)), tmp_path)
-    assert begun == [0, 0, 0]
-
-
-def test_what_killed_makers_without_locks_left_goes_after_an_hour(tmp_path: Path) -> None:
-    old, young, foreign = (
-        tmp_path / name for name in (".a.zarr.01.partial", ".a.zarr.23.partial", ".b.zarr.01.partial")
-    )
-    for folder in (old, young, foreign):
-        (folder / "c").mkdir(parents=True)
-    for folder in (old, foreign):
-        for path in (folder / "c", folder):
-            os.utime(path, (time.time() - 4000,) * 2)
-    made_once(tmp_path / "a.zarr", make([]))
-    assert {path.name for path in tmp_path.iterdir()} == {"a.zarr", young.name, foreign.name}
