@@ -2,8 +2,8 @@
 
 python -m experiments.simulate benchmark=shop_grid     # and shop_exit, shop_handover
 python -m experiments.goller
-python -m experiments.goller handover=<recording>      # not those of shop_handover beside the scenarios
-python -m experiments.goller scenarios=<folder of the suite> most=3 fit_steps=0
+python -m experiments.goller handover=<recording>      # instead of those of shop_handover beside the scenarios
+python -m experiments.goller scenarios=<folder of the suite> max_recordings=3 fit_steps=0
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
+    from tagjax.baselines.goller.experiment import GollerExperiment, run_goller
     from tagjax.config import from_mapping
     from tagjax.data.store import open_recording
-    from tagjax.evaluation.goller import GollerConfig, run_goller
 
     values = resolved(config)
     folder = Path(HydraConfig.get().runtime.output_dir)
     OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
     console = Console()
     with in_a_line("goller"), console.status("observing", spinner="line") as status:
-        checked = from_mapping(GollerConfig, values)
-        metrics = run_goller(checked, open_recording, folder, on_done=lambda name: status.update(f"observed {name}"))
+        checked = from_mapping(GollerExperiment, values)
+        metrics = run_goller(checked, folder, open_recording=open_recording, on_progress=status.update)
     console.print((folder / "tables.md").read_text(), markup=False)
     if metrics["handover"] is None:
-        told = "no hand-over: `python -m experiments.simulate benchmark=shop_handover` makes recordings of some"
-        console.print(told, soft_wrap=True, highlight=False)
+        hint = "no hand-over: `python -m experiments.simulate benchmark=shop_handover` makes such recordings"
+        console.print(hint, soft_wrap=True, highlight=False)
     console.print(f"run folder: {folder}")
     print(json.dumps(metrics, allow_nan=False))
 
