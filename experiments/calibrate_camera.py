@@ -1,4 +1,4 @@
-"""Calibrate a camera from pictures of a checkerboard, and place it over the plane that the board lies on.
+"""Calibrate a camera from pictures of a checkerboard, and find its pose over the plane on which the board lies.
 
 python -m experiments.calibrate_camera pictures=<folder> board.columns=7 board.rows=5 board.square_m=0.041
 python -m experiments.calibrate_camera pictures=<folder> 'poses=[{picture: table.png}]' out=camera.json
@@ -20,7 +20,12 @@ from .train import CONFIGS, resolved
 def main(config: DictConfig) -> None:
     from rich.console import Console
 
-    from tagjax.baselines.tagvision import CalibrateSettings, calibrate_folder, write_calibration, write_corners
+    from tagjax.baselines.tagvision.picture_folder import (
+        CalibrateSettings,
+        calibrate_folder,
+        write_calibration,
+        write_corners,
+    )
     from tagjax.config import from_mapping
 
     values = resolved(config)
@@ -32,11 +37,11 @@ def main(config: DictConfig) -> None:
         found = calibrate_folder(settings)
         write_calibration(found, settings.out)
         drawn = write_corners(found, settings.out)
-    told = (
-        f"a board looks the same from either end: {drawn} shows the first corner and the axes. Where it is the other end "
-        "than you mean, give that corner's place as origin_m and turn_deg 180 more."
+    hint = (
+        f"a board looks the same from either end: {drawn} shows the first corner and the axes. If you meant the other end, "
+        "give that corner's position as origin_m and add 180 to turn_deg."
     )
-    for line in (*found.said(), *([told] if settings.poses else []), f"written to {settings.out} and {drawn}"):
+    for line in (*found.summary(), *([hint] if settings.poses else []), f"written to {settings.out} and {drawn}"):
         console.print(line, markup=False)
 
 

@@ -1,8 +1,8 @@
-"""Tagview's experiments on simulated suites: trains named, tables and plots; or its detector trained.
+"""Tagview's experiments on simulated suites: identification, tables and plots; or the training of its detector.
 
 python -m experiments.simulate benchmark=ceiling_2     # and ceiling_3 to ceiling_6, separated_traces, half_wavelength
 python -m experiments.tagview
-python -m experiments.tagview most=4 'suites=[ceiling_4]' system.detector.kind=motion
+python -m experiments.tagview max_recordings=4 'suites=[ceiling_4]' system.detector.kind=motion
 python -m experiments.tagview command=train            # writes detector.npz to the run folder
 python -m experiments.tagview system.detector.weights=<file>
 """
@@ -27,8 +27,8 @@ def main(config: DictConfig) -> None:
     from rich.markdown import Markdown
     from rich.progress import Progress
 
+    from tagjax.baselines.tagview.experiment import TagviewExperiment, report_markdown, run_tagview, train_tagview
     from tagjax.config import from_mapping
-    from tagjax.evaluation.tagview import TagviewExperiment, run_tagview, table, train_tagview
 
     values = resolved(config)
     command, progress = values.pop("command"), values.pop("progress")
@@ -42,7 +42,7 @@ def main(config: DictConfig) -> None:
         with Progress(console=console, disable=not progress) as bar:
             task = bar.add_task("tagview", total=None)
             if command == "train":
-                total = checked.training.recipe.num_steps
+                total = checked.training.settings.num_steps
                 metrics = train_tagview(
                     checked,
                     folder,
@@ -59,8 +59,8 @@ def main(config: DictConfig) -> None:
                     ),
                 )
     if command == "run":
-        console.print(Markdown(table(metrics)))
-    console.print(f"all of it in {folder}", soft_wrap=True, highlight=False)
+        console.print(Markdown(report_markdown(metrics)))
+    console.print(f"tables, plots and metrics in {folder}", soft_wrap=True, highlight=False)
     print(json.dumps(metrics, allow_nan=False))
 
 

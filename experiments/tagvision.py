@@ -1,4 +1,4 @@
-"""TagVision's experiments: parallel lines, calibration, things that move over a table; the last line is JSON.
+"""TagVision's experiments: parallel lines, calibration, objects that move over a table; the last line is JSON.
 
 python -m experiments.tagvision                                    # lines and calibration, a minute
 python -m experiments.tagvision benchmark=planar_tracks            # and the suite, simulated first where missing
@@ -24,8 +24,8 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
 
+    from tagjax.baselines.tagvision.experiment import TagVisionExperiment, report_markdown, run_tagvision
     from tagjax.config import from_mapping
-    from tagjax.evaluation.tagvision import TagVisionExperiment, run_tagvision, table
 
     values = resolved(config)
     progress = values.pop("progress")
@@ -37,7 +37,7 @@ def main(config: DictConfig) -> None:
         checked = from_mapping(TagVisionExperiment, values)
         with console.status("TagVision") as status:
             metrics = run_tagvision(checked, folder, on_progress=status.update if progress else None)
-    console.print(Markdown(table(metrics)))
+    console.print(Markdown(report_markdown(metrics)))
     console.print(f"plots, table.md and metrics.json in {folder}", soft_wrap=True, highlight=False)
     print(json.dumps(metrics, allow_nan=False))
 

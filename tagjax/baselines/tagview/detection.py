@@ -1,4 +1,4 @@
-"""Detectors: boxes of the things in a picture, by the trained network or by what moves before a still background."""
+"""Detection of objects in pictures (Tagview, III.A): by the trained network, or by motion against a still background."""
 
 from __future__ import annotations
 
@@ -14,58 +14,64 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped, UInt8
 
-from ._anchors import STRIDE_PX, decode, default_boxes
-from ._boxes import suppress
-from ._network import BoxNetwork
-from ._weights import load_detector
+from ..boxes import non_maximum_suppression
+from ..opencv import background_model, foreground
+from .default_boxes import STRIDE_PX, decode, default_boxes
+from .network import BoxNetwork
+from .weights import load_weights
+
+_MAX_BOXES = 400
+_MAX_AREA = 0.05  # of a moving object, as a fraction of the picture
 
 
 @dataclasses.dataclass(frozen=True)
 class DetectorSettings:
-    """`ssd` is the paper's; `motion` needs no training and sees only what moves."""
+    """`ssd` is the paper's detector; `motion` needs no training and detects only what moves."""
 
     kind: Literal["ssd", "motion"] = "ssd"
-    weights: str | None = None  # of ssd: a file, the packaged ones if None
-    width_px: int = 256  # that pictures are brought to: things of 0.2 m on a table are about 14 wide then
-    least_score: float = 0.8  # of ssd
-    most_overlap: float = 0.3  # of two detections
-    history: int = 200  # of motion: frames that the background is learnt from
-    least_difference: float = 16.0  # of motion: squared distance to the background, in variances
-    least_side_px: float = 4.0  # of motion
+    weights: str | None = None  # of ssd: a file, the packaged one if None
+    width_px: int = 256  # to which pictures are resized: objects of 0.2 m on a table are then about 14 wide
+    min_score: float = 0.8  # of ssd
+    max_iou: float = 0.3  # of two detections
+    background_frames: int = 200  # of motion: memory of the background model
+    background_threshold: float = 16.0  # of motion: squared distance, in variances, up to which a pixel is background
+    min_side_px: float = 4.0  # of motion
 
     def __post_init__(self):
         if self.kind not in ("ssd", "motion"):
             raise ValueError(f"kind is {self.kind!r}; expected ssd or motion.")
-        if self.width_px < 32 or self.history < 2:
-            raise ValueError(f"width_px {self.width_px}, history {self.history}; expected at least 32 and 2.")
-        if not (0 < self.least_score < 1 and 0 <= self.most_overlap <= 1 and self.least_difference > 0):
+        if self.width_px < 32 or self.background_frames < 2:
             raise ValueError(
-                f"least_score {self.least_score}, most_overlap {self.most_overlap}, least_difference "
-                f"{self.least_difference}; expected shares, and a positive number."
+                f"width_px {self.width_px}, background_frames {self.background_frames}; expected at least 32 and 2."
+            )
+        if not (0 < self.min_score < 1 and 0 <= self.max_iou <= 1 and self.background_threshold > 0):
+            raise ValueError(
+                f"min_score {self.min_score}, max_iou {self.max_iou}, background_threshold {self.background_threshold}; "
+                "expected two fractions and a positive number."
             )
 
 
 class AbstractDetector(abc.ABC):
-    """Boxes of the things in a video's pictures, one after the other."""
+    """Boxes of the objects in the pictures of a video, one picture after the other."""
 
     @abc.abstractmethod
-    def begin(self) -> Any:
+    def init(self) -> Any:
         """The state before the first picture."""
 
     @abc.abstractmethod
     def detect(
         self, state: Any, image: UInt8[np.ndarray, "height width 3"]
     ) -> tuple[Any, Float[np.ndarray, "boxes 4"], Float[np.ndarray, " boxes"]]:
-        """The next state, boxes in the picture's pixels, and their scores, 0 to 1."""
+        """The next state, boxes (x0 y0 x1 y1, first and last pixel), and their scores, 0 to 1."""
 
 
 class BoxDetector(AbstractDetector):
-    """The single-shot detector (III.A). It has no memory."""
+    """The single-shot detector (III.A), without a state."""
 
     def __init__(self, network: BoxNetwork, settings: DetectorSettings):
         self.network, self.settings = network, settings
 
-    def begin(self) -> None:
+    def init(self) -> None:
         return None
 
     def detect(self, state: None, image: UInt8[np.ndarray, "height width 3"]):
@@ -76,47 +82,49 @@ class BoxDetector(AbstractDetector):
             small = np.asarray(cv2.resize(image, (self.settings.width_px, rows), interpolation=cv2.INTER_AREA))
         below, beside = -rows % STRIDE_PX, -self.settings.width_px % STRIDE_PX
         padded = np.pad(small, ((0, below), (0, beside), (0, 0)), mode="edge")
-        chance, offset = (np.asarray(one, np.float64) for one in _run(self.network, jnp.asarray(padded)))
-        likely = np.flatnonzero(chance >= self.settings.least_score)
-        # Enough for any picture; suppression compares all with all.
-        likely = likely[np.argsort(-chance[likely], kind="stable")[:400]]
+        score, offset = (np.asarray(one, np.float64) for one in _run(self.network, jnp.asarray(padded)))
+        likely = np.flatnonzero(score >= self.settings.min_score)
+        # Suppression compares all pairs: the number of boxes is limited.
+        likely = likely[np.argsort(-score[likely], kind="stable")[:_MAX_BOXES]]
         boxes = decode(offset[likely], _defaults(padded.shape[0], padded.shape[1])[likely])
-        kept = suppress(boxes, chance[likely], self.settings.most_overlap)
+        kept = non_maximum_suppression(boxes, score[likely], self.settings.max_iou)
         scale = np.array([width / self.settings.width_px, height / rows] * 2)
-        return None, (boxes[kept] + 0.5) * scale - 0.5, chance[likely][kept]
+        last = np.array([0, 0, 1, 1])
+        return None, (boxes[kept] + last) * scale - last, score[likely][kept]
 
 
 class MotionDetector(AbstractDetector):
-    """What differs from the background's mixture of Gaussians (OpenCV's MOG2), cleaned and boxed.
+    """Boxes of the foreground of OpenCV's background model.
 
-    The mixture is OpenCV's own and changes as it learns: a state serves one run.
+    OpenCV updates the model in place: a state serves one run.
     """
 
     def __init__(self, settings: DetectorSettings):
         self.settings = settings
 
-    def begin(self) -> Any:
-        return cv2.createBackgroundSubtractorMOG2(self.settings.history, self.settings.least_difference, True)
+    def init(self) -> Any:
+        return background_model(self.settings.background_frames, self.settings.background_threshold)
 
     def detect(self, state: Any, image: UInt8[np.ndarray, "height width 3"]):
         scale = image.shape[1] / self.settings.width_px
-        moved = np.asarray(state.apply(image)) == 255
+        moved = foreground(state, image)
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (max(round(3 * scale), 1),) * 2)
         cleaned = cv2.morphologyEx(moved.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         cleaned = cv2.morphologyEx(cleaned, cv2.MORPH_OPEN, kernel)
         _, _, table, _ = cv2.connectedComponentsWithStats(cleaned)
         left, top, wide, high = (table[1:, column].astype(np.float64) for column in range(4))
-        least = self.settings.least_side_px * scale
-        large = (wide >= least) & (high >= least) & (wide * high < 0.05 * image.shape[0] * image.shape[1])
-        boxes = np.stack([left, top, left + wide, top + high], axis=1)[large] - 0.5
+        min_side = self.settings.min_side_px * scale
+        max_area = _MAX_AREA * image.shape[0] * image.shape[1]
+        large = (wide >= min_side) & (high >= min_side) & (wide * high < max_area)
+        boxes = np.stack([left, top, left + wide - 1, top + high - 1], axis=1)[large]
         return state, boxes, np.ones(len(boxes))
 
 
 def make_detector(settings: DetectorSettings) -> AbstractDetector:
-    """The detector that settings ask for; raises `ValueError` for weights that cannot be read."""
+    """The detector of some settings. Raises `ValueError` for weights that cannot be read."""
     if settings.kind == "motion":
         return MotionDetector(settings)
-    return BoxDetector(load_detector(settings.weights)[0], settings)
+    return BoxDetector(load_weights(settings.weights)[0], settings)
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""Hermite interpolation of unevenly spaced samples (Tagview, IV.B): to bring reads and frames to the same times."""
+"""Hermite interpolation of unevenly spaced samples (Tagview, IV.B), to bring reads to the times of frames."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def interpolate(
     valid: Bool[Array, " knots"],
     at_s: Float[Array, " at"],
 ) -> Float[Array, " at"]:
-    """Monotone cubic Hermite interpolation (Fritsch and Butland, 1984; SciPy's PCHIP), `value` held beyond the ends.
+    """Monotone cubic Hermite interpolation (Fritsch and Butland, 1984; SciPy's PCHIP), constant beyond the ends.
 
-    Times do not fall; of equal ones the last counts. Valid knots come first, padding after them. One knot gives a
-    constant, two a line, none 0. Finite gradients throughout: a knot at which the secants change sign has slope 0.
+    Times are sorted; of equal ones the last is used. Valid knots come first, padding after them. One knot gives a
+    constant, two a line, none 0. Gradients are finite: a knot at which the secants change sign has slope 0.
     """
     size = value.shape[0]
     if size < 2:
@@ -31,11 +31,11 @@ def interpolate(
     knots = jnp.where(valid, time_s, jnp.inf)
     left = jnp.clip(jnp.searchsorted(knots, at_s, side="right").astype(jnp.int32) - 1, 0, jnp.maximum(final - 1, 0))
     inside = jnp.clip(at_s, time_s[0], time_s[final])
-    share = jnp.clip(safe_divide(inside - time_s[left], width[left]), 0.0, 1.0)
-    rest = 1.0 - share
-    # Written from the nearer knot's value, so that large phases lose no digits.
-    bend = share * rest * width[left] * (rest * slope[left] - share * slope[left + 1])
-    rise = share * share * (3.0 - 2.0 * share) * (value[left + 1] - value[left])
+    fraction = jnp.clip(safe_divide(inside - time_s[left], width[left]), 0.0, 1.0)
+    complement = 1.0 - fraction
+    # Relative to the left knot's value, so that large phases lose no digits.
+    bend = fraction * complement * width[left] * (complement * slope[left] - fraction * slope[left + 1])
+    rise = fraction * fraction * (3.0 - 2.0 * fraction) * (value[left + 1] - value[left])
     return jnp.where(count > 0, value[left] + rise + bend, 0.0)
 
 
@@ -58,7 +58,7 @@ def _slopes(width: Float[Array, " gaps"], secant: Float[Array, " gaps"], final: 
 
 
 def _end_slope(near: Array, far: Array, secant: Array, further: Array) -> Array:
-    """Three-point derivative at an end, kept to the shape of the data (as in SciPy)."""
+    """Three-point derivative at an end, limited to preserve the shape of the data (as in SciPy)."""
     slope = safe_divide((2.0 * near + far) * secant - near * further, near + far)
     slope = jnp.where(slope * secant <= 0, 0.0, slope)
     limit = (secant * further <= 0) & (jnp.abs(slope) > 3.0 * jnp.abs(secant))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ._anchors import SHAPES_PX
+from .default_boxes import SHAPES_PX
 
 
 class Convolution(eqx.Module):
@@ -33,7 +33,7 @@ class Convolution(eqx.Module):
 class BoxNetwork(eqx.Module):
     """Scores and offsets of all default boxes of a picture, at a quarter of its resolution.
 
-    One scale of feature map, where SSD has several: a camera at the ceiling sees all things at nearly one size.
+    One scale of feature map, where SSD has several: a camera at the ceiling sees all objects at nearly one size.
     """
 
     layers: tuple[Convolution, ...]
@@ -46,14 +46,14 @@ class BoxNetwork(eqx.Module):
         sizes += [(widths[2], widths[2], 1)] * (depth - 1)
         self.layers = tuple(Convolution(*size, key=one) for size, one in zip(sizes, keys[:-1], strict=False))
         head = Convolution(widths[2], 5 * len(SHAPES_PX), 1, key=keys[-1])
-        # Nearly all default boxes are nothing: say so from the start.
+        # Nearly all default boxes are background: the initial bias expresses it.
         bias = jnp.zeros((len(SHAPES_PX), 5)).at[:, 0].set(-4.0).reshape(-1)
         self.head = eqx.tree_at(lambda h: (h.weight, h.bias), head, (0.1 * head.weight, bias))
 
     def __call__(self, image: Float[Array, "height width 3"]) -> tuple[Float[Array, " boxes"], Float[Array, "boxes 4"]]:
-        """Log odds that each default box stands for a thing, and its offsets. Sides are multiples of 4, RGB 0 to 1."""
+        """Log odds that each default box contains an object, and its offsets. Sides are multiples of 4, RGB 0 to 1."""
         x = (image - 0.5) * 4.0
         for layer in self.layers:
             x = jax.nn.relu(layer(x))
-        said = self.head(x).reshape(-1, 5)
-        return said[:, 0], said[:, 1:]
+        output = self.head(x).reshape(-1, 5)
+        return output[:, 0], output[:, 1:]

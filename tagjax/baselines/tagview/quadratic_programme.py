@@ -1,4 +1,4 @@
-"""The binary quadratic programme that names all traces (Tagview, V.D, Eq. 10), solved with proof by HiGHS."""
+"""The binary quadratic programme that identifies all traces (Tagview, V.D, Eq. 10), solved to a proven bound by HiGHS."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 
 @dataclasses.dataclass(frozen=True)
 class Selection:
-    """Edges chosen, what they are worth, and the least upper bound proven: the gap is 0 where it is the optimum."""
+    """The chosen edges, their objective value, and the proven upper bound."""
 
     chosen: Bool[np.ndarray, " edges"]
     value: float
@@ -21,7 +21,7 @@ class Selection:
 
     @property
     def gap(self) -> float:
-        """(bound - value) / |bound|: no selection is better by more than this share."""
+        """(bound - value) / |bound|: no selection is better by more than this fraction; 0 at the optimum."""
         return max(self.bound - self.value, 0.0) / max(abs(self.bound), 1e-9)
 
 
@@ -34,26 +34,26 @@ def select_edges(
 ) -> Selection:
     """max_x x^T Q x + w^T x, x binary, at most one edge of every clique: Eq. 10 with mu within Q.
 
-    Q is symmetric. Its diagonal counts too (Eq. 9 leaves the agreement of an edge with itself open; `edge_agreement` sets
-    0). Each product x_e x_f of edges that may go together becomes a variable y_ef, 0 to 1. For an edge e and a clique K
-    without it, x_e times "at most one of K" gives sum_{f in K} y_ef <= x_e: the linear programme is far tighter than with
-    y_ef <= x_e one by one, and mostly whole at the root. Where Q is negative, y_ef >= x_e + x_f - 1. HiGHS ends at the optimum, or with
-    the proven bound at the time limit; at worst nothing is chosen and the bound is the sum of all that is positive. Raises `ValueError`
-    for Q that is not symmetric or not finite.
+    Q is symmetric. Its diagonal counts too (Eq. 9 does not define the agreement of an edge with itself; `edge_agreement`
+    sets 0). Each product x_e x_f of compatible edges becomes a variable y_ef, 0 to 1. For an edge e and a clique K without
+    it, x_e times "at most one of K" gives sum_{f in K} y_ef <= x_e: this relaxation is far tighter than y_ef <= x_e for
+    each f, and its solution is mostly integral at the root. Where Q is negative, y_ef >= x_e + x_f - 1. HiGHS ends at the
+    optimum, or at the time limit with a proven bound; in the worst case nothing is chosen and the bound is the sum of all
+    positive terms. Raises `ValueError` for a Q that is not symmetric or not finite.
     """
     weight, quadratic = np.asarray(weight, np.float64), np.asarray(quadratic, np.float64)
     num = len(weight)
     if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(quadratic))):
-        raise ValueError("Weights or agreements are not finite; expected numbers.")
+        raise ValueError("Weights or agreements are not finite; expected finite numbers.")
     if not np.allclose(quadratic, quadratic.T):
-        raise ValueError("The quadratic term is not symmetric; expected what every two edges are worth together.")
+        raise ValueError("The quadratic term is not symmetric; expected one value for every two edges.")
     linear = weight + np.diag(quadratic)
     if num == 0:
         return Selection(np.zeros(0, bool), 0.0, 0.0)
-    apart = np.zeros((num, num), bool)
+    incompatible = np.zeros((num, num), bool)
     for clique in cliques:
-        apart[np.ix_(clique, clique)] = True
-    first, second = np.nonzero(np.triu(~apart & (quadratic != 0), 1))
+        incompatible[np.ix_(clique, clique)] = True
+    first, second = np.nonzero(np.triu(~incompatible & (quadratic != 0), 1))
     product = np.full((num, num), -1)
     product[first, second] = product[second, first] = num + np.arange(len(first))
     cost = -np.concatenate([linear, 2.0 * quadratic[first, second]])
@@ -61,8 +61,8 @@ def select_edges(
     integrality = np.concatenate([np.ones(num), np.zeros(len(first))])
     options = {"time_limit": time_limit_s, "mip_rel_gap": 0.0}
     found = milp(cost, integrality=integrality, bounds=Bounds(0, 1), constraints=limits, options=options)
-    worst = float(np.maximum(linear, 0.0).sum() + 2.0 * np.maximum(quadratic[first, second], 0.0).sum())
-    bound = worst if found.mip_dual_bound is None else min(worst, -float(found.mip_dual_bound))
+    trivial = float(np.maximum(linear, 0.0).sum() + 2.0 * np.maximum(quadratic[first, second], 0.0).sum())
+    bound = trivial if found.mip_dual_bound is None else min(trivial, -float(found.mip_dual_bound))
     chosen = np.zeros(num, bool) if found.x is None else found.x[:num] > 0.5
     value = float(linear @ chosen + quadratic[np.ix_(chosen, chosen)].sum() - np.diag(quadratic)[chosen].sum())
     return Selection(chosen, value, max(bound, value))
@@ -75,12 +75,12 @@ def _rows(
     cliques: Sequence[Int[np.ndarray, " _"]],
     size: int,
 ) -> list[LinearConstraint]:
-    """P x <= 1, and what ties each product to its edges: from above where it is worth something, else from below."""
+    """P x <= 1, and the bounds of each product by its edges: upper ones for positive Q, lower ones for negative Q."""
     row, column, entry, upper = [], [], [], []
 
-    def add(places: Sequence[int], values: Sequence[float], limit: float) -> None:
-        row.extend([len(upper)] * len(places))
-        column.extend(places)
+    def add(columns: Sequence[int], values: Sequence[float], limit: float) -> None:
+        row.extend([len(upper)] * len(columns))
+        column.extend(columns)
         entry.extend(values)
         upper.append(limit)
 
@@ -90,14 +90,14 @@ def _rows(
         add([int(edge), int(other), int(product[edge, other])], [1.0, 1.0, -1.0], 1.0)
     product = np.where(negative, -1, product)
     for edge in range(num):
-        loose = product[edge] >= 0
+        unbounded = product[edge] >= 0
         for clique in cliques:
             terms = product[edge, clique]
             terms = terms[terms >= 0]
             if len(terms):
-                loose[clique] = False
+                unbounded[clique] = False
                 add([*terms.tolist(), edge], [1.0] * len(terms) + [-1.0], 0.0)
-        for term in product[edge, loose]:
+        for term in product[edge, unbounded]:
             add([int(term), edge], [1.0, -1.0], 0.0)
     if not upper:
         return []

@@ -1,4 +1,4 @@
-"""Weights of the detector as plain arrays: one .npz file, with the recipe that made them as JSON text in it."""
+"""Weights of the detector as plain arrays: one .npz file, with the settings of its training as JSON text in it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import equinox as eqx
 import jax
 
 from ...arrays_file import ArraysFile
-from ._network import BoxNetwork
+from .network import BoxNetwork
 
-_WIDEST, _DEEPEST = 1024, 32
+_MAX_WIDTH, _MAX_DEPTH = 1024, 32
 
 PACKAGED = Path(__file__).parent / "detector.npz"
 """The weights that come with the package."""
@@ -23,33 +23,33 @@ _FILE = ArraysFile(
 )
 
 
-def save_detector(path: str | Path, network: BoxNetwork, about: Mapping[str, Any]) -> None:
-    """Write a network in half precision; `about` holds `network` (its settings), and recipe and scores as one likes."""
+def save_weights(path: str | Path, network: BoxNetwork, about: Mapping[str, Any]) -> None:
+    """Write a network in half precision; `about` holds `network` (its settings), and may hold training settings and scores."""
     if not isinstance(about.get("network"), Mapping):
-        raise ValueError(f"about holds {sorted(about)}; expected `network`, the settings that build it.")
+        raise ValueError(f"about holds {sorted(about)}; expected `network`, the settings of the network.")
     _FILE.write(path, network, about, half=True)
 
 
-def load_detector(path: str | Path | None = None) -> tuple[BoxNetwork, dict[str, Any]]:
-    """The network of a file (the packaged one if None), and what the file says of itself.
+def load_weights(path: str | Path | None = None) -> tuple[BoxNetwork, dict[str, Any]]:
+    """The network of a file (the packaged one if None), and the file's `about`.
 
-    Nothing in a file is executed. Raises `ValueError` for one that is missing, damaged or foreign.
+    Nothing in a file is executed. Raises `ValueError` for a file that is missing, damaged or of another kind.
     """
     path = PACKAGED if path is None else Path(path)
     about = _FILE.about(path)
-    said: Any = about.get("network")
-    said = said if isinstance(said, Mapping) else {}
-    widths, depth = said.get("widths"), said.get("depth")
-    told = isinstance(widths, list) and len(widths) == 3 and all(_within(width, _WIDEST) for width in widths)
-    if not told or not _within(depth, _DEEPEST):
+    network: Any = about.get("network")
+    network = network if isinstance(network, Mapping) else {}
+    widths, depth = network.get("widths"), network.get("depth")
+    complete = isinstance(widths, list) and len(widths) == 3 and all(_within(width, _MAX_WIDTH) for width in widths)
+    if not complete or not _within(depth, _MAX_DEPTH):
         found = ", ".join(f"{key}: {reprlib.repr(value)}" for key, value in (("widths", widths), ("depth", depth)))
         raise ValueError(
-            f"{path}: does not say which network it is of (found {found}; expected 3 whole widths of 1 to {_WIDEST} and a "
-            f"depth of 1 to {_DEEPEST}). Train again, or copy the file again."
+            f"{path}: no valid settings of its network: found {found}; expected 3 integer widths of 1 to {_MAX_WIDTH} and a "
+            f"depth of 1 to {_MAX_DEPTH}. Train again, or copy the file again."
         )
-    network = eqx.filter_eval_shape(lambda: BoxNetwork((widths[0], widths[1], widths[2]), depth, key=jax.random.key(0)))
-    return _FILE.fill(network, path), about
+    empty = eqx.filter_eval_shape(lambda: BoxNetwork((widths[0], widths[1], widths[2]), depth, key=jax.random.key(0)))
+    return _FILE.fill(empty, path), about
 
 
-def _within(value: Any, most: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most
+def _within(value: Any, largest: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= largest

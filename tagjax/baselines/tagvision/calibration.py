@@ -161,7 +161,9 @@ def camera_pose(
         raise CalibrationError(f"Found {len(points_m)} points, expected at least 4 that are not in line. Add points.")
     spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
     if spread[1] < 1e-3 * spread[0] or spread[0] == 0:
-        raise CalibrationError("All points lie in line, expected at least 4 that span a plane. Add points beside the line.")
+        raise CalibrationError(
+            "All points lie in line, expected at least 4 that span a plane. Add points beside the line."
+        )
     matrix, distortion = intrinsics.matrix(), np.array(intrinsics.distortion or (0.0,) * 5)
     world, seen = np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(pixels, np.float64)
     flags = cv2.SOLVEPNP_IPPE if spread[2] < 1e-6 * spread[0] else cv2.SOLVEPNP_SQPNP

@@ -129,7 +129,9 @@ def match_scores(
     def one_round(round_key: PRNGKeyArray) -> Float[Array, " candidates"]:
         def one(own: Float[Array, " snapshots"], valid: Bool[Array, " snapshots"]) -> Float[Array, ""]:
             index, counted = draw_snapshots(valid, num_snapshots, key=round_key)
-            return phase_score(own[index], counted, sigma_rad=sigma_rad, reference=reference, angle_multiple=angle_multiple)
+            return phase_score(
+                own[index], counted, sigma_rad=sigma_rad, reference=reference, angle_multiple=angle_multiple
+            )
 
         return jax.vmap(one)(residual, snapshots.valid)
 

@@ -66,7 +66,9 @@ class FolderCalibration:
         ]
         if self.camera.reprojection_px > MAX_ERROR_PX:
             worst = int(np.argmax(self.camera.view_reprojection_px))
-            lines.append(f"doubtful: above {MAX_ERROR_PX:g} px. The worst picture is {self.used[worst]}; is the board flat?")
+            lines.append(
+                f"doubtful: above {MAX_ERROR_PX:g} px. The worst picture is {self.used[worst]}; is the board flat?"
+            )
         if self.plane is None:
             lines.append("no pose: give poses=[{picture: ...}] with the board on the plane, for positions in the world")
         else:
@@ -114,7 +116,9 @@ def calibrate_folder(settings: CalibrateSettings) -> FolderCalibration:
             views.append(corners)
     if len(shapes) > 1:
         found = ", ".join(f"{width} x {height} ({name})" for (height, width), name in shapes.items())
-        raise CalibrationError(f"{folder}: found pictures of several sizes: {found}; expected one size. Use pictures of one camera.")
+        raise CalibrationError(
+            f"{folder}: found pictures of several sizes: {found}; expected one size. Use pictures of one camera."
+        )
     board = settings.board
     if not views:
         raise CalibrationError(
@@ -158,7 +162,9 @@ def _pose(
             )
         corners = find_corners(picture, board)
         if corners is None:
-            raise CalibrationError(f"{pose.picture}: the board is not visible with all its inner corners. Take another picture.")
+            raise CalibrationError(
+                f"{pose.picture}: the board is not visible with all its inner corners. Take another picture."
+            )
         c, s = np.cos(np.radians(pose.turn_deg)), np.sin(np.radians(pose.turn_deg))
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         places.append(board.corners_m() @ turn.T + np.array([*pose.origin_m, 0.0]))
@@ -175,9 +181,7 @@ def _pose(
         if best is None or found.reprojection_px < best.reprojection_px:
             best, order = found, turned
     if best is None:
-        raise CalibrationError(
-            "No pose explains the pictures of the board on the plane. Check origin_m and turn_deg."
-        )
+        raise CalibrationError("No pose explains the pictures of the board on the plane. Check origin_m and turn_deg.")
     boards = []
     for pose, place, corners in zip(poses, places, order, strict=True):
         error_px = float(np.sqrt(np.mean(np.sum((best.to_picture(place) - corners) ** 2, axis=1))))

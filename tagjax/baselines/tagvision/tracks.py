@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from ...association import hard_assignment
-from ..boxes import box_centre_px
 from ..opencv import mean_shift, place_in_picture
 from .detection import Blob, fill_holes
 
@@ -228,7 +227,9 @@ def _assign(moved: Sequence[BlobTrack], blobs: Sequence[Blob], settings: TrackSe
             distance = float(np.linalg.norm(blob.centre_px - track.centre_px)) / size
             same_size = 1 / _MAX_AREA_RATIO < blob.area_px / track.area_px < _MAX_AREA_RATIO
             # An object that begins to move is detected in part; a lost track has no better position.
-            if distance < settings.max_distance and (same_size or track.num_blobs < _YOUNG_BLOBS or not track.is_seen()):
+            if distance < settings.max_distance and (
+                same_size or track.num_blobs < _YOUNG_BLOBS or not track.is_seen()
+            ):
                 score[i, j] = -distance
             if distance < settings.max_distance or _covers(blob, track.centre_px):
                 covered.add(j)

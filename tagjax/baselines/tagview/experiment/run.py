@@ -1,8 +1,7 @@
-"""All of Tagview's experiments in one run, and the training of its detector."""
+"""Tagview's experiments in one run: identification on simulated suites; metrics, tables and plots."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,60 +9,53 @@ from typing import Any
 
 import numpy as np
 
-from ..._numerics import SPEED_OF_LIGHT_M_S
-from ...baselines.tagview import (
-    BoxDetector,
-    MatchSettings,
-    ReadSettings,
-    TagviewSettings,
-    TagviewTracer,
-    TrainSettings,
-    labelled_frames,
-    measure_detector,
-    save_detector,
-    train_detector,
+from ...._numerics import SPEED_OF_LIGHT_M_S
+from ....data.store import open_recording
+from ....files import write_csv, write_json, write_text
+from ....recording import Recording
+from ....suite_folder import SPLITS, find_recordings
+from ..matching import MatchSettings
+from ..sequences import ReadSettings
+from ..settings import TagviewSettings
+from ..tracer import TagviewTracer
+from .detector import DetectorTraining
+from .scoring import (
+    RecordingScore,
+    TrackedRecording,
+    plane_depth_m,
+    quartiles,
+    score_recording,
+    summarise,
+    track_recording,
 )
-from ...data.store import open_recording
-from ...recording import Recording
-from ..report import write_json
-from ._figures import accuracy_plot, pair_plot, track_plot
-from ._judge import Judged, Watched, judge, watch
-from ._table import PAPER_GROUPS, quartiles, summarise, table
+from .tables import PAPER, report_markdown
 
-PAPER = {"accuracy": 0.98, "hungarian": 0.91, "tracking_error_px": 4.82, "groups": PAPER_GROUPS}
-"""What the paper reports of its own experiments."""
+Scores = Mapping[str, Mapping[str, Sequence[RecordingScore]]]
+"""Scores by group of recordings and by setting."""
 
-SPLITS = ("train", "validation", "test")
+_COUNTS = ("one", "two", "three", "four", "five", "six")
+_SAME_PHASE = "half_wavelength"  # the suite whose tags have the same phases: its wrong pairs fit as well
 
 
 @dataclasses.dataclass(frozen=True)
 class Matching:
-    """One way to name the traces, compared with others on the same ones."""
+    """One setting of the identification, compared with others on the same traces."""
 
     match: MatchSettings = dataclasses.field(default_factory=MatchSettings)
     reads: ReadSettings = dataclasses.field(default_factory=ReadSettings)
 
 
 @dataclasses.dataclass(frozen=True)
-class DetectorTraining:
-    """Which recordings the detector is trained and measured on, and how."""
-
-    recipe: TrainSettings = dataclasses.field(default_factory=TrainSettings)
-    weights: str = "detector.npz"  # written there, within the run folder unless absolute
-    measure_every: int = 4  # of the validation frames
-
-
-@dataclasses.dataclass(frozen=True)
 class TagviewExperiment:
-    """What is run, on recordings that `experiments.simulate` has made."""
+    """What is run, on recordings made by `experiments.simulate`."""
 
     recordings: str = "recordings/benchmark"
     suites: tuple[str, ...] = ()
     split: str = "test"
-    most: int | None = None  # recordings of a variant; all if None
+    max_recordings: int | None = None  # of a variant; all if None
     system: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
     matching: Mapping[str, Matching] = dataclasses.field(default_factory=dict)
-    whole: str = "tagview"  # the one of them that the paper's figures stand beside
+    main: str = "tagview"  # the setting beside which the paper's figures stand
     training: DetectorTraining = dataclasses.field(default_factory=DetectorTraining)
 
     def __post_init__(self):
@@ -71,48 +63,47 @@ class TagviewExperiment:
             raise ValueError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
         if not self.suites:
             raise ValueError("suites is empty; expected names of suites under `recordings`.")
-        if self.whole not in self.matching:
-            raise ValueError(f"whole is {self.whole!r}; expected one of {', '.join(self.matching) or 'none given'}.")
+        if self.main not in self.matching:
+            raise ValueError(f"main is {self.main!r}; expected one of {', '.join(self.matching) or 'none given'}.")
+
+    def find(self, split: str) -> list[tuple[str, Path]]:
+        """Group (suite and variant) and path of each recording of a split.
+
+        Raises `ValueError` where a suite has none.
+        """
+        found: list[tuple[str, Path]] = []
+        for suite in self.suites:
+            recordings = find_recordings(Path(self.recordings) / suite, split, self.max_recordings)
+            if not recordings:
+                raise ValueError(
+                    f"{self.recordings}/{suite}/{split}: no recording. `python -m experiments.simulate benchmark={suite} "
+                    f"out={self.recordings}` makes some."
+                )
+            recordings.sort(key=lambda one: (_count(one.variant), one))
+            found += [(suite if one.variant == "all" else f"{suite} {one.variant}", one.path) for one in recordings]
+        return found
 
 
-def find_recordings(root: str, suite: str, split: str, most: int | None = None) -> list[tuple[str, Path]]:
-    """Group and path of a suite's recordings; raises `ValueError` where there is none."""
-    found = []
-    for path in (Path(root) / suite / split).glob("*.zarr"):
-        parts = path.stem.rsplit("-", 3)
-        if len(parts) == 4 and parts[3].isdigit() and (most is None or int(parts[3]) < most):
-            group = suite if parts[1] == "all" else f"{suite} {parts[1]}"
-            found.append((group, int(parts[3]), path))
-    if not found:
-        raise ValueError(
-            f"{root}/{suite}/{split}: no recording. `python -m experiments.simulate benchmark={suite} out={root}` makes some."
-        )
-    order = {group: place for place, group in enumerate(_by_count({group for group, _, _ in found}))}
-    return [(group, path) for group, _, path in sorted(found, key=lambda one: (order[one[0]], one[1]))]
-
-
-def _by_count(groups: set[str]) -> list[str]:
-    names = ("two", "three", "four")
-    return sorted(
-        groups, key=lambda group: (names.index(group.split()[-1]) if group.split()[-1] in names else -1, group)
-    )
+def _count(variant: str) -> int:
+    """Number of tags of a variant named by it; variants with other names come first."""
+    return _COUNTS.index(variant) if variant in _COUNTS else -1
 
 
 def run_tagview(
     config: TagviewExperiment, folder: Path, *, on_progress: Callable[[str, int, int], None] | None = None
 ) -> dict[str, Any]:
-    """Follow and name everything; writes `metrics.json`, `report.md`, `recordings.csv` and plots, returns the metrics.
+    """Track and identify all recordings; writes `metrics.json`, `report.md`, `recordings.csv` and plots.
 
-    `on_progress` is told the recording at hand, its number and how many there are. Raises `ValueError` for suites
-    without recordings and for recordings that Tagview does not apply to.
+    Returns the metrics. `on_progress` gets the recording's name, its number and the number of recordings. Raises
+    `ValueError` for suites without recordings and for recordings to which Tagview does not apply.
     """
+    from .. import figures  # needs matplotlib
+
+    todo = config.find(config.split)
     folder.mkdir(parents=True, exist_ok=True)
-    todo = [
-        one for suite in config.suites for one in find_recordings(config.recordings, suite, config.split, config.most)
-    ]
     tracer = TagviewTracer(dataclasses.replace(config.system, memory_s=1e9))
-    found: dict[str, dict[str, list[Judged]]] = {}
-    pixel_mm, rows = [], 0
+    scores: dict[str, dict[str, list[RecordingScore]]] = {}
+    mm_per_px, num_rows = [], 0
     for number, (group, path) in enumerate(todo):
         recording = open_recording(path)
         if on_progress is not None:
@@ -120,119 +111,93 @@ def run_tagview(
         reason = tracer.inapplicable(recording)
         if reason is not None:
             raise ValueError(f"{recording.name}: Tagview does not apply: {reason}")
-        seen = watch(tracer, recording)
-        judged = judge_all(config, tracer, recording, seen)
-        for name, one in judged.items():
-            found.setdefault(group, {}).setdefault(name, []).append(one)
-        pixel_mm.append(seen.mm_px)
-        rows = recording.image_shape[0]
+        tracked = track_recording(tracer, recording)
+        for name, score in _score_settings(config, tracer, recording, tracked).items():
+            scores.setdefault(group, {}).setdefault(name, []).append(score)
+        mm_per_px.append(tracked.mm_per_px)
+        num_rows = recording.image_shape[0]
         if number == 0:
-            track_plot(folder / "tracks.png", seen, np.asarray(recording.colour[0]))
-    metrics = _metrics(config, found, float(np.mean(pixel_mm)), rows)
-    whole = [one for group in found.values() for one in group[config.whole]]
-    pair_plot(folder / "pairs.png", [one for one in whole if not one.recording.startswith("half_wavelength")])
-    accuracy = accuracy_by_tags(found)
-    if accuracy:
-        accuracy_plot(folder / "accuracy.png", accuracy)
-    _write_rows(folder / "recordings.csv", found)
+            picture = np.asarray(recording.colour[0])
+            figures.track_plot(folder / "tracks.png", tracked.name, tracked.truth_px, tracked.box_px, picture)
+    metrics = _metrics(config, scores, float(np.mean(mm_per_px)), num_rows)
+    main = [one for group in scores.values() for one in group[config.main]]
+    pairs = [one for one in main if not one.recording.startswith(_SAME_PHASE)]
+    figures.pair_plot(folder / "pairs.png", pairs)
+    if accuracy := _accuracy_by_tags(scores):
+        figures.accuracy_plot(folder / "accuracy.png", accuracy)
+    _write_recordings(folder / "recordings.csv", scores)
     write_json(folder / "metrics.json", metrics)
-    (folder / "report.md").write_text(table(metrics))
+    write_text(folder / "report.md", report_markdown(metrics))
     return metrics
 
 
-def judge_all(
-    config: TagviewExperiment, tracer: TagviewTracer, recording: Recording, seen: Watched
-) -> dict[str, Judged]:
-    """The recording named with every setting."""
-    truth = recording.truth
-    assert truth is not None
-    depth_m = float(np.nanmedian([np.nanmedian(truth.tag_position_m[epc][:, 2]) for epc in seen.epcs]))
+def _score_settings(
+    config: TagviewExperiment, tracer: TagviewTracer, recording: Recording, tracked: TrackedRecording
+) -> dict[str, RecordingScore]:
+    """The recording's score with every setting."""
     carrier_hz = float(np.nanmedian(recording.reads.carrier_hz))
-    true_slope = 4 * np.pi * depth_m * carrier_hz / SPEED_OF_LIGHT_M_S
-    least = max(round(config.system.least_trace_s * recording.frame_rate_hz), 1)
-    return {
-        name: judge(seen, tracer, way.match, way.reads, least_frames=least, true_slope=true_slope)
-        for name, way in config.matching.items()
-    }
+    true_slope = 4 * np.pi * plane_depth_m(recording) * carrier_hz / SPEED_OF_LIGHT_M_S
+    min_frames = max(round(config.system.min_trace_s * recording.frame_rate_hz), 1)
+    scores = {}
+    for name, setting in config.matching.items():
+        found, _ = tracer.identify(tracked.camera, tracked.state, setting.match, setting.reads)
+        scores[name] = score_recording(tracked, found, min_frames=min_frames, true_slope=true_slope)
+    return scores
 
 
-def accuracy_by_tags(found: Mapping[str, Mapping[str, Sequence[Judged]]]) -> dict[str, dict[int, float]]:
+def _accuracy_by_tags(scores: Scores) -> dict[str, dict[int, float]]:
     """Accuracy of each setting by number of tags, over the suites named ceiling_*."""
-    out: dict[str, dict[int, list[Judged]]] = {}
-    for group, settings in found.items():
+    by_count: dict[str, dict[int, list[RecordingScore]]] = {}
+    for group, settings in scores.items():
         if group.startswith("ceiling_"):
-            for name, judged in settings.items():
-                for one in judged:
-                    out.setdefault(name, {}).setdefault(one.num_tags, []).append(one)
+            for name, ones in settings.items():
+                for one in ones:
+                    by_count.setdefault(name, {}).setdefault(one.num_tags, []).append(one)
     return {
-        name: {count: value for count, judged in counts.items() if (value := summarise(judged)["accuracy"]) is not None}
-        for name, counts in out.items()
+        name: {count: value for count, ones in counts.items() if (value := summarise(ones)["accuracy"]) is not None}
+        for name, counts in by_count.items()
     }
 
 
-def _metrics(
-    config: TagviewExperiment, found: Mapping[str, Mapping[str, Sequence[Judged]]], mm_px: float, rows: int
-) -> dict[str, Any]:
-    groups = {
-        group: {name: summarise(judged) for name, judged in settings.items()} for group, settings in found.items()
-    }
-    tables = [group for group in found if group.startswith("ceiling_")]
-    if tables:
+def _metrics(config: TagviewExperiment, scores: Scores, mm_per_px: float, num_rows: int) -> dict[str, Any]:
+    groups = {group: {name: summarise(ones) for name, ones in settings.items()} for group, settings in scores.items()}
+    ceiling = [group for group in scores if group.startswith("ceiling_")]
+    if ceiling:
         groups["ceiling, all"] = {
-            name: summarise([one for group in tables for one in found[group][name]]) for name in config.matching
+            name: summarise([one for group in ceiling for one in scores[group][name]]) for name in config.matching
         }
-    whole = [one for settings in found.values() for one in settings[config.whole]]
-    errors = np.concatenate([one.error_px for one in whole])
-    like = [one for one in whole if not one.recording.startswith("half_wavelength")]
+    main = [one for settings in scores.values() for one in settings[config.main]]
+    errors = np.concatenate([one.error_px for one in main])
+    pairs = [one for one in main if not one.recording.startswith(_SAME_PHASE)]
     error_px, std_px = (float(x) if len(errors) else 0.0 for x in (errors.mean(), errors.std()))
     return {
         "paper": PAPER,
-        "whole": config.whole,
+        "main": config.main,
         "groups": groups,
-        "tracking": {"error_px": error_px, "std_px": std_px, "error_mm": error_px * mm_px, "height_px": rows},
-        "pairs": {kind: quartiles(like, kind) for kind in ("r_squared", "slope")},
+        "tracking": {
+            "error_px": error_px,
+            "std_px": std_px,
+            "error_mm": error_px * mm_per_px,
+            "height_px": num_rows,
+        },
+        "pairs": {kind: quartiles(pairs, kind) for kind in ("r_squared", "slope")},
     }
 
 
-def _write_rows(path: Path, found: Mapping[str, Mapping[str, Sequence[Judged]]]) -> None:
-    names = ("num_tags", "num_traces", "num_false", "num_right", "num_named", "num_stretches", "num_found", "gap")
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("group", "setting", "recording", *names, "error_px"))
-        for group, settings in found.items():
-            for name, judged in settings.items():
-                for one in judged:
-                    error = f"{one.error_px.mean():.3f}" if len(one.error_px) else ""
-                    writer.writerow((group, name, one.recording, *(getattr(one, key) for key in names), error))
-
-
-def train_tagview(
-    config: TagviewExperiment, folder: Path, *, on_step: Callable[[int, float], None] | None = None
-) -> dict[str, Any]:
-    """Train the detector on the suites' train split, measure it on the validation split, write its weights.
-
-    Raises `ValueError` for suites without train recordings; those without validation are left out of the measure.
-    """
-    training, settings = config.training, config.training.recipe
-    frames, measured, used = [], [], {}
-    for suite in config.suites:
-        paths = find_recordings(config.recordings, suite, "train", config.most)
-        used[suite] = len(paths)
-        for _, path in paths:
-            frames += labelled_frames(open_recording(path), every=settings.every, least_side_px=settings.least_side_px)
-        for path in sorted((Path(config.recordings) / suite / "validation").glob("*.zarr")):
-            measured += labelled_frames(
-                open_recording(path), every=training.measure_every, least_side_px=settings.least_side_px
-            )
-    network, recipe = train_detector(frames, settings, on_step=on_step)
-    chosen = dataclasses.replace(config.system.detector, kind="ssd")
-    scores = measure_detector(BoxDetector(network, chosen), measured) if measured else {}
-    about = {
-        "network": {"widths": list(settings.widths), "depth": settings.depth},
-        "recipe": recipe,
-        "data": {"train recordings": used, "validation frames": len(measured)},
-        "validation": {name: value for name, value in scores.items() if np.isfinite(value)},
-    }
-    save_detector(folder / training.weights, network, about)
-    write_json(folder / "training.json", about)
-    return about
+def _write_recordings(path: Path, scores: Scores) -> None:
+    counts = (
+        "num_tags", "num_traces", "num_false", "num_correct", "num_identified", "num_stretches", "num_covered", "gap",
+    )  # fmt: skip
+    rows = [
+        (
+            group,
+            name,
+            one.recording,
+            *(getattr(one, key) for key in counts),
+            f"{one.error_px.mean():.3f}" if len(one.error_px) else None,
+        )
+        for group, settings in scores.items()
+        for name, ones in settings.items()
+        for one in ones
+    ]
+    write_csv(path, ("group", "setting", "recording", *counts, "error_px"), rows)

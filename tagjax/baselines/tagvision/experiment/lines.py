@@ -1,4 +1,4 @@
-"""TagVision's simulation (Fig. 6): scores of parallel lines, one of which carries the tag."""
+"""TagVision's simulation (Fig. 6): scores of parallel lines, one of which is the path of the tag."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...baselines.tagvision import PHASE_NOISE_RAD, phase_score, theory_rad
-from ...sim.planar import PlanarSettings, planar_trials
+from ..phase_score import PHASE_NOISE_RAD, phase_score, theory_rad
 
 
 @dataclasses.dataclass(frozen=True)
 class LineSettings:
-    """Where the lines of Fig. 6 and the antenna lie. `circle_m` bends every line into a circle of that radius."""
+    """Geometry of the lines of Fig. 6 and the antenna. `circle_m` bends every line into a circle of that radius."""
 
     name: str = "stated"
     reference: Literal["first", "absolute"] = "first"
@@ -31,7 +30,7 @@ class LineSettings:
 
 @dataclasses.dataclass(frozen=True)
 class LineScores:
-    """Scores of all lines, and what they say."""
+    """Scores of all lines in all rounds."""
 
     settings: LineSettings
     line_m: Float[np.ndarray, " lines"]
@@ -39,33 +38,35 @@ class LineScores:
     scores: Float[np.ndarray, "rounds lines"]
 
     def curve(self, rounds: int | None = None) -> Float[np.ndarray, " lines"]:
-        """The mean over the first so many rounds (all if None), divided by its maximum as in Fig. 6."""
+        """The mean over the first `rounds` rounds (all if None), divided by its maximum as in Fig. 6."""
         mean = self.scores[:rounds].mean(axis=0)
         return mean / mean.max()
 
     def summary(self) -> dict[str, float]:
-        """Figures of the curve of all rounds, and of the rounds one by one."""
+        """Statistics of the curve of all rounds, and of single rounds."""
         curve, best = self.curve(), np.argmax(self.scores, axis=1)
         others = np.delete(curve, self.true_line)
         return {
             "truth_is_maximum": float(np.argmax(curve) == self.true_line),
-            "truth_is_maximum_share_of_rounds": float(np.mean(best == self.true_line)),
+            "truth_is_maximum_fraction_of_rounds": float(np.mean(best == self.true_line)),
             "error_of_a_round_mm": float(np.mean(np.abs(self.line_m[best] - self.line_m[self.true_line])) * 1e3),
             "others_below_0.075": float(np.mean(others < 0.075)),
-            "others_least": float(others.min()),
+            "others_min": float(others.min()),
             "others_median": float(np.median(others)),
             "others_90_percent_below": float(np.quantile(others, 0.9)),
-            "others_most": float(others.max()),
+            "others_max": float(others.max()),
             "neighbours": float(0.5 * (curve[self.true_line - 1] + curve[self.true_line + 1])),
         }
 
 
 def line_scores(settings: LineSettings) -> LineScores:
-    """Score 101 lines 6 mm apart, the middle one with the tag (Fig. 6), by "absolute" or "first"-sample reference.
+    """Score 101 lines 6 mm apart, the middle one with the tag (Fig. 6), with the "absolute" or the "first" sample's phase as reference.
 
     Straight lines and their phases are `sim.planar`'s. With the first sample as reference an unknown constant is added
     to every round's phases, as a real reader does.
     """
+    from ....sim.planar import PlanarSettings, planar_trials  # needs the simulator
+
     drawn = planar_trials(
         PlanarSettings(
             num_samples=settings.num_samples,

@@ -1,4 +1,4 @@
-"""How well TagVision's calibration turns pixels into places (VI.B), on simulated views of a checkerboard."""
+"""Accuracy of TagVision's calibration in world positions (VI.B), on simulated views of a checkerboard."""
 
 from __future__ import annotations
 
@@ -6,31 +6,33 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from ...baselines.tagvision import Board, PlaneCamera, calibrate, locate
-from ...recording import Intrinsics
+from ....recording import Intrinsics
+from ..calibration import Board, calibrate, camera_pose
+from ..plane import PlaneCamera
 
 PAPER_CAMERA = Intrinsics(1000.0, 1000.0, 639.5, 359.5, 1280, 720, (-0.12, 0.05, 0.0, 0.0, 0.0))
-"""A 720p web camera with a wide lens' distortion; the paper's table of its own is not at hand, so these are assumed."""
+"""A 720p web camera with the distortion of a wide lens; assumed, since the paper does not give its values."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationSettings:
-    """Simulated pictures of a board: how many, and how well its corners are found."""
+    """Simulated pictures of a board: their number, and the accuracy of its corners."""
 
     board: Board = dataclasses.field(default_factory=Board)
-    num_views: int = 24  # of which the intrinsics are made, as in the paper
-    num_places: int = 9  # of the board on the plane, of which the pose is made
-    corner_noise_px: float = 0.1  # what `find_corners` shows on drawn boards
+    num_views: int = 24  # for the intrinsics, as in the paper
+    num_board_positions: int = 9  # of the board on the plane, for the pose
+    corner_noise_px: float = 0.1  # as measured with `find_corners` on drawn boards
     seed: int = 0
 
 
 def board_views(
     camera: Intrinsics, settings: CalibrationSettings, rng: np.random.Generator
 ) -> list[Float[np.ndarray, "corners 2"]]:
-    """Corners of the board held before the camera at random distances, places and tilts, all within the picture."""
+    """Corners of the board in front of the camera at random distances, positions and tilts, all within the picture."""
     corners = settings.board.corners_m()
-    middle = corners - corners.mean(axis=0)
+    centred = corners - corners.mean(axis=0)
     size_m = float(np.linalg.norm(np.ptp(corners, axis=0)))
     views = []
     while len(views) < settings.num_views:
@@ -38,29 +40,21 @@ def board_views(
         reach = np.array([camera.width / camera.fx_px, camera.height / camera.fy_px]) * distance * 0.5
         place = np.array([*rng.uniform(-reach, reach), distance])
         tilt = rng.uniform(-0.7, 0.7, 2)
-        turn = _turn(np.pi + tilt[0], 0) @ _turn(tilt[1], 1) @ _turn(rng.uniform(-np.pi, np.pi), 2)
-        # A camera that stands where the board's frame has its origin sees it moved and turned.
-        seen = PlaneCamera(camera, turn, place).to_picture(middle)
+        about_z = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
+        rotation = Rotation.from_euler("x", np.pi + tilt[0]) * Rotation.from_euler("y", tilt[1]) * about_z
+        seen = PlaneCamera(camera, rotation.as_matrix(), place).to_picture(centred)
         seen = seen + settings.corner_noise_px * rng.normal(size=seen.shape)
         if np.all(seen >= 0) and np.all(seen <= [camera.width - 1, camera.height - 1]):
             views.append(seen)
     return views
 
 
-def _turn(angle_rad: float, axis: int) -> np.ndarray:
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    first, second = [(1, 2), (2, 0), (0, 1)][axis]
-    out = np.eye(3)
-    out[[first, second, first, second], [first, second, second, first]] = c, c, -s, s
-    return out
-
-
-def calibrated(
+def simulate_calibration(
     true: PlaneCamera, area_m: tuple[float, float, float, float], settings: CalibrationSettings
 ) -> PlaneCamera:
-    """The camera as calibration finds it: intrinsics from board views, its place from the board laid on the plane.
+    """The calibrated camera: intrinsics from views of the board, the pose from the board lying on the plane.
 
-    `area_m` (x0 y0 x1 y1) is where the board is laid, in turn, in `num_places` known places.
+    The board lies at `num_board_positions` known positions within `area_m` (x0 y0 x1 y1).
     """
     rng = np.random.default_rng([settings.seed, 7])
     k = true.intrinsics
@@ -69,14 +63,14 @@ def calibrated(
     corners = corners - corners.min(axis=0)
     span = corners.max(axis=0)[:2]
     low, high = np.array(area_m[:2]), np.maximum(np.array(area_m[2:]) - span, area_m[:2])
-    side = int(np.ceil(np.sqrt(settings.num_places)))
+    side = int(np.ceil(np.sqrt(settings.num_board_positions)))
     grid = np.stack(np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)), axis=-1).reshape(-1, 2)
-    shares = grid[: settings.num_places] if settings.num_places > 1 else np.array([[0.5, 0.5]])
-    laid = np.concatenate([corners + np.array([*(low + share * (high - low)), 0.0]) for share in shares])
+    fractions = grid[: settings.num_board_positions] if settings.num_board_positions > 1 else np.array([[0.5, 0.5]])
+    laid = np.concatenate([corners + np.array([*(low + fraction * (high - low)), 0.0]) for fraction in fractions])
     pixels = true.to_picture(laid)
     inside = np.all((pixels >= 0) & (pixels <= [k.width - 1, k.height - 1]), axis=1)
     pixels = pixels + settings.corner_noise_px * rng.normal(size=pixels.shape)
-    return locate(laid[inside], pixels[inside], found.intrinsics)
+    return camera_pose(laid[inside], pixels[inside], found.intrinsics)
 
 
 def transform_error_m(
@@ -87,7 +81,7 @@ def transform_error_m(
     pixel_noise_px: float = 0.0,
     seed: int = 0,
 ) -> Float[np.ndarray, " points"]:
-    """How far points of the plane come out from where they are, when their pixels (with noise) are turned back."""
+    """Distance of points of the plane from where a calibration maps their pixels (with noise)."""
     x, y = np.meshgrid(np.linspace(area_m[0], area_m[2], 13), np.linspace(area_m[1], area_m[3], 25))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
     pixels = true.to_picture(points)
