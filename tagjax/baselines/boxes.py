@@ -22,7 +22,7 @@ def box_size_px(box_px: Shaped[np.ndarray, "*boxes 4"]) -> Shaped[np.ndarray, "*
 
 def box_area_px(box_px: Shaped[np.ndarray, "*boxes 4"]) -> Shaped[np.ndarray, "*boxes"]:
     """Area in square pixels, 0 for a box whose last pixel lies before its first."""
-    return np.prod(np.maximum(box_size_px(box_px), 0), axis=-1)
+    return np.asarray(np.prod(np.maximum(box_size_px(box_px), 0), axis=-1))
 
 
 def box_centre_px(box_px: Shaped[np.ndarray, "*boxes 4"]) -> Shaped[np.ndarray, "*boxes 2"]:
