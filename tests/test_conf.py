@@ -16,13 +16,13 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
 from experiments.compare import suites_named
-from tagjax.baselines.tagview import MatchSettings
+from tagjax.baselines.goller.experiment import GollerExperiment
+from tagjax.baselines.tagview.experiment import TagviewExperiment
+from tagjax.baselines.tagview.matching import MatchSettings
 from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, TrainFlowConfig, build, from_mapping
 from tagjax.evaluation.compare import SystemSettings
 from tagjax.evaluation.evaluate import ScoreSettings
 from tagjax.evaluation.flow import FlowEvaluationSettings
-from tagjax.evaluation.goller import GollerConfig
-from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.sim.suites import PLANAR, Suite
 from tagjax.tagattention import TagAttention
@@ -94,7 +94,7 @@ def test_flow_evaluation_configurations_are_valid() -> None:
     assert settings.flows
 
 
-@pytest.mark.parametrize(("name", "schema"), [("goller", GollerConfig), ("tagview", TagviewExperiment)])
+@pytest.mark.parametrize(("name", "schema"), [("goller", GollerExperiment), ("tagview", TagviewExperiment)])
 def test_forerunners_configurations_are_valid(name: str, schema: type) -> None:
     values = _compose(name)
     fields = {field.name for field in dataclasses.fields(schema)}

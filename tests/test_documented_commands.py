@@ -17,16 +17,16 @@ from omegaconf import OmegaConf
 
 from experiments.benchmark import with_cases
 from experiments.compare import with_suites
+from tagjax.baselines.goller.experiment import GollerExperiment
+from tagjax.baselines.tagview.experiment import TagviewExperiment
 from tagjax.config import EvaluateConfig, SimulateConfig, TrainConfig, TrainFlowConfig, from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
-from tagjax.evaluation.goller import GollerConfig
-from tagjax.evaluation.tagview._run import TagviewExperiment
 
 ROOT = Path(__file__).parents[1]
 SCHEMAS: dict[str, type] = {
     "evaluate": EvaluateConfig,
     "evaluate_flow": FlowEvaluationSettings,
-    "goller": GollerConfig,
+    "goller": GollerExperiment,
     "simulate": SimulateConfig,
     "tagview": TagviewExperiment,
     "train": TrainConfig,

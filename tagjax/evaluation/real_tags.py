@@ -20,7 +20,7 @@ import scipy.optimize
 from jaxtyping import Array, Float
 
 from ..attention import att_corr
-from .tagged_walks import LEAST_READS, SMOOTH_S, Speeds, TaggedRecording, Walk
+from ..data.importers.tagged_walks import MIN_READS, SMOOTH_S, Speeds, TaggedRecording, Walk
 
 SCORES = ("TagAttention, Eq. 5", "Tagview, R^2", "correlation of speeds")
 """Those that ask for no scale: correlation of relative distances over k frames, and of distances and of speeds over the window.
@@ -48,7 +48,7 @@ def heard_speed(speeds: Speeds, time_s: Float[np.ndarray, " frames"]) -> Float[n
     """A tag's speed towards the antenna at these times, weighted by nearness; NaN where it is hardly read."""
     weight = np.exp(-0.5 * np.square((time_s[:, None] - speeds.time_s[None]) / SMOOTH_S))
     count = weight.sum(axis=1)
-    return np.where(count >= LEAST_READS, weight @ speeds.towards_m_s / np.maximum(count, 1e-9), np.nan)
+    return np.where(count >= MIN_READS, weight @ speeds.towards_m_s / np.maximum(count, 1e-9), np.nan)
 
 
 class _Pair:

@@ -18,8 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from ..attention import att_corr, att_rbf, attention, coherent_score
-from ..baselines.tagview import ReadSettings, fit_pairs, hear
-from ..baselines.tagvision import Snapshots, match_scores
+from ..baselines.tagview.line_fit import fit_pairs
+from ..baselines.tagview.sequences import ReadSettings, tag_measurements
+from ..baselines.tagvision.phase_score import Snapshots, match_scores
+from ..data.importers.tagged_walks import load_tagged, load_uwb, read_kinect, read_xovis
 from ..recording import RecordingError, TagReads
 from ..rf.channels import estimate_slope
 from ..rf.windows import phase_reads, radio_windows
@@ -28,7 +30,6 @@ from ..sim.virtual_tag import Track, virtual_reads
 from ..viz.tracks import accuracy_plot, speeds_plot
 from .real_tags import SCORES, associate, speed_scores, speed_windows
 from .report import write_json
-from .tagged_walks import load_tagged, load_uwb, read_kinect, read_xovis
 
 METHODS = (
     "TagAttention, coherent",
@@ -208,9 +209,9 @@ def association_scores(window: Window, *, seed: int = 0) -> dict[str, Float[np.n
         multiple=2 if flips else 1,
         hop_slope_rad_hz=jnp.asarray(slope, jnp.float32),
     )
-    said = hear([_EPC], window.reads, stamp, window.time_s, ReadSettings()).sequences
+    said = tag_measurements([_EPC], window.reads, stamp, window.time_s, ReadSettings()).sequences
     # Tagview's factor is the distance in units of the antenna's height; R^2 does not ask for the unit.
-    fit = fit_pairs(distance, jnp.ones(distance.shape, bool), said.phase_rad, said.heard, said.piece)
+    fit = fit_pairs(distance, jnp.ones(distance.shape, bool), said.phase_rad, said.phase_known, said.piece)
     line = jnp.where(fit.slope[:, 0] > 0, fit.r_squared[:, 0], 0.0)
     return dict(
         zip(METHODS, (np.asarray(x, np.float64) for x in (coherent, plain, attended, vision, line)), strict=True)
