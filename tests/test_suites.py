@@ -484,7 +484,7 @@ def test_impossible_suites_are_refused():
 
 
 def test_planar_trials_follow_the_geometry(tmp_path):
-    """Without noise the phase is that of the true line, and no other line is as coherent: TagVision's Fig. 6."""
+    """Without noise the phase is that of the true line, and of no other line: TagVision's Fig. 6."""
     trials = planar_trials(PlanarSettings(noise_rad=0.0, num_rounds=3), seed=1)
     assert trials.line_m[trials.true_line] == 0
     np.testing.assert_allclose(np.diff(trials.line_m), 0.006)
@@ -492,9 +492,8 @@ def test_planar_trials_follow_the_geometry(tmp_path):
     distance_m = np.hypot(trials.line_m[:, None, None] - 1.018, trials.sample_m)
     phasor = np.exp(1j * (trials.phase_rad - 4 * np.pi * trials.carrier_hz * distance_m / 299792458.0))
     np.testing.assert_allclose(np.angle(phasor[trials.true_line]), 0, atol=1e-9)
-    coherence = np.abs(phasor.mean(axis=-1))
-    np.testing.assert_allclose(coherence[trials.true_line], 1, atol=1e-9)
-    assert np.all(np.delete(coherence, trials.true_line, axis=0) < 0.9999)
+    largest_rad = np.abs(np.angle(phasor)).max(axis=(1, 2))
+    assert np.all(np.delete(largest_rad, trials.true_line) > 0.2)
     suite = Suite("planar", "a test", "none", PLANAR, 2, counts=Counts(0, 0, 1), settings={"num_rounds": 2})
     make_suite(suite, tmp_path)
     stored = open_planar(suite.items()[0].path(tmp_path))

@@ -1,8 +1,8 @@
 """The systems published before TagAttention, each from raw recordings to the tables of its own paper.
 
-Each package has the same inside: `tracer` (the system), `detection`, `tracks` and `matching` (its method), `calibration`
-or `training`, `experiment` (the paper's tables; needs recordings) and `figures` (needs matplotlib). `host_trace` runs any
-of them over a recording; `AbstractHostTracer` is their common interface.
+Each package has the same inside: `tracer` (the system), `detection`, `tracks` and `matching` (its method),
+`calibration` or `training`, `experiment` (the paper's tables; needs recordings) and `figures` (needs matplotlib).
+`host_trace` runs any of them over a recording; `AbstractHostTracer` is their common interface.
 """
 
 from .host_tracer import AbstractHostTracer as AbstractHostTracer

@@ -1,9 +1,10 @@
 """Tracers that run on the host: OpenCV detects and tracks, so there is no `lax.scan`, but the interface is the same.
 
-`AbstractHostTracer` is a state machine as `AbstractTracer` is: `init`, one `step` a frame, `finish`. Its input is colour
-pictures instead of flow and depth (no baseline has a depth camera) and raw reads instead of distances; its output is a
-`Trace` at the full size of the picture. `host_trace` yields the same pairs as the tracing of `AbstractTracer`, so the same
-code scores both. Everything is causal: at a frame only the reads up to that frame are used.
+`AbstractHostTracer` is a state machine as `AbstractTracer` is: `init`, one `step` a frame, `finish`. Its input is
+colour pictures instead of flow and depth (no baseline has a depth camera) and raw reads instead of distances; its
+output is a `Trace` at the full size of the picture. `host_trace` yields the same pairs as the tracing of
+`AbstractTracer`, so the same code scores both. Everything is causal: at a frame only the reads up to that frame are
+used.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class AbstractHostTracer(abc.ABC):
 
     @abc.abstractmethod
     def inapplicable(self, recording: Recording) -> str | None:
-        """Why the method's assumptions do not hold for a recording, in a sentence for a table's cell; None if they do."""
+        """Why the method's assumptions do not hold for a recording, in a sentence for a table's cell; None if they
+        do.
+        """
 
     @abc.abstractmethod
     def init(self, camera: HostCamera) -> Any:
@@ -113,7 +116,8 @@ def host_trace(
     """Run a host tracer over a recording: each frame's number and `Trace` (NumPy leaves, tags in the order of `epcs`).
 
     Frames are yielded one by one, so that masks do not accumulate. Raises `RecordingError` where there is no tag, for a
-    recording that `Recording.check` refuses (depth may be missing), or where the method does not apply (`inapplicable`).
+    recording that `Recording.check` refuses (depth may be missing), or where the method does not apply
+    (`inapplicable`).
     """
     traced = tuple(recording.resolve_epcs(epcs))
     if not traced:

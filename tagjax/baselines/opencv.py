@@ -17,8 +17,8 @@ _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 1.0)
 def background_model(num_frames: int, threshold: float, *, shadow: float = 0.5) -> Any:
     """A mixture of Gaussians for every pixel (Zivkovic, 2004; MOG2), which OpenCV updates in place.
 
-    `num_frames` is its memory, `threshold` the squared distance in variances up to which a pixel is background, `shadow`
-    the darkest shadow as a fraction of the background's brightness.
+    `num_frames` is its memory, `threshold` the squared distance in variances up to which a pixel is background,
+    `shadow` the darkest shadow as a fraction of the background's brightness.
     """
     model = cv2.createBackgroundSubtractorMOG2(num_frames, threshold, True)
     model.setShadowThreshold(shadow)

@@ -1,4 +1,6 @@
-"""Tag reads as the phase-based baselines use them: joined over frames, of one antenna, with a sign and hops corrected."""
+"""Tag reads as the phase-based baselines use them: joined over frames, of one antenna, with a sign and hops
+corrected.
+"""
 
 from __future__ import annotations
 

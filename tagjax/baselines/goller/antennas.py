@@ -1,4 +1,6 @@
-"""Goller et al.'s antenna model (III.A, III.D): one Gaussian an antenna over the floor, fitted to RSSI on a tag grid."""
+"""Goller et al.'s antenna model (III.A, III.D): one Gaussian an antenna over the floor, fitted to RSSI on a tag
+grid.
+"""
 
 from __future__ import annotations
 

@@ -17,10 +17,10 @@ _BORDER_PX = 2
 class BlobLocator:
     """Positions of blobs in the room frame, by `BlobSettings.position`.
 
-    "centre", for a camera that looks down, as the paper's: the ray of the box's centre meets the plane at half the height
-    of a person. "foot", for a camera that looks along the room: the ray of the lowest pixels meets the floor; where the
-    picture cuts the feet off, the ray of the highest pixels meets the plane at the person's height. "depth": the median
-    of the depth camera's points, which the paper does not have.
+    "centre", for a camera that looks down, as the paper's: the ray of the box's centre meets the plane at half the
+    height of a person. "foot", for a camera that looks along the room: the ray of the lowest pixels meets the floor;
+    where the picture cuts the feet off, the ray of the highest pixels meets the plane at the person's height. "depth":
+    the median of the depth camera's points, which the paper does not have.
     """
 
     def __init__(self, settings: BlobSettings, room: RoomFrame, intrinsics: Intrinsics):
@@ -59,7 +59,9 @@ class BlobLocator:
         return bool(box_px[1] > _BORDER_PX) and not self.cuts_feet(box_px)
 
     def height_m(self, box_px: Shaped[np.ndarray, " 4"], position_m: Float[np.ndarray, " 2"]) -> float:
-        """Height of the ray of a box's upper edge over a position on the floor; `person_height_m` if that is undefined."""
+        """Height of the ray of a box's upper edge over a position on the floor; `person_height_m` if that is
+        undefined.
+        """
         pixel = np.array([[box_centre_px(box_px)[0], float(box_px[1])]])
         ground, above = (self._room.pixels_on_plane(pixel, self._intrinsics, height)[0] for height in (0.0, 1.0))
         if not np.isfinite([ground, above]).all():

@@ -39,7 +39,8 @@ class Calibration(eqx.Module):
 def calibrate(recording: Recording, *, floor_dbm: float = FLOOR_DBM, fit_means: bool = False) -> Calibration:
     """The antennas from a recording of a tag grid (III.D); everything else at its initial value.
 
-    Raises `RecordingError` where the recording holds no true positions of its tag, `ValueError` where they do not suffice.
+    Raises `RecordingError` where the recording holds no true positions of its tag, `ValueError` where they do not
+    suffice.
     """
     room = find_room_frame(recording)
     statistic = grid_statistic(recording, room)
@@ -62,7 +63,9 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read a calibration. Raises `ValueError` for a file that cannot be read or holds other values than a calibration."""
+    """Read a calibration. Raises `ValueError` for a file that cannot be read or holds other values than a
+    calibration.
+    """
     try:
         found = json.loads(Path(path).read_text())
         skew_m = found[".location.antennas.skew_m"]

@@ -1,4 +1,6 @@
-"""Plots: antennas (Figs. 9, 10), hand-over (Fig. 7), ROC (Table I), blobs with their tags (Fig. 12). Needs matplotlib."""
+"""Plots: antennas (Figs. 9, 10), hand-over (Fig. 7), ROC (Table I), blobs with their tags (Fig. 12). Needs
+matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -39,17 +41,28 @@ def antenna_plot(path: Path, statistic: GridStatistic, model: AntennaModel) -> N
     shown = {"cmap": "viridis", "vmin": levels[0], "vmax": levels[-1]}
     shades: Any = None
     for antenna in range(num):
-        upper, lower, there = grid[0, antenna], grid[1, antenna], received[:, antenna]
+        upper, lower, is_received = grid[0, antenna], grid[1, antenna], received[:, antenna]
         shades = upper.contourf(x, y, modelled[:, antenna].reshape(x.shape), levels, **shown)
-        places = statistic.position_m
-        upper.scatter(*places[there].T, c=measured[there, antenna], edgecolors="w", s=45, **shown)
-        upper.plot(*places[~there].T, "x", color="0.8", markersize=5)
+        points_m = statistic.position_m
+        upper.scatter(*points_m[is_received].T, c=measured[is_received, antenna], edgecolors="w", s=45, **shown)
+        upper.plot(*points_m[~is_received].T, "x", color="0.8", markersize=5)
         upper.plot(*np.asarray(model.mean_m[antenna]), "r+", markersize=12)
         upper.set(aspect="equal")
         upper.set_title(f"antenna {antenna + 1}", fontsize=9)
-        along = np.abs(places[:, 1]) < 0.5
-        lower.plot(places[along & there, 0], measured[along & there, antenna], "k.", label="measured, |y| < 0.5 m")
-        lower.plot(places[along & ~there, 0], measured[along & ~there, antenna], "x", color="0.5", label="not received")
+        along = np.abs(points_m[:, 1]) < 0.5
+        lower.plot(
+            points_m[along & is_received, 0],
+            measured[along & is_received, antenna],
+            "k.",
+            label="measured, |y| < 0.5 m",
+        )
+        lower.plot(
+            points_m[along & ~is_received, 0],
+            measured[along & ~is_received, antenna],
+            "x",
+            color="0.5",
+            label="not received",
+        )
         line = jnp.asarray(np.stack([axes_x, np.zeros_like(axes_x)], axis=-1), jnp.float32)
         bell = np.asarray(jax.vmap(lambda point: response_db(model, point))(line))[:, antenna] + floor_dbm
         lower.plot(axes_x, bell, "r", label="Gaussian, y = 0")
@@ -110,9 +123,9 @@ def association_plot(
     for number, blob in enumerate([0, *blobs]):
         colour = _COLOURS[number % len(_COLOURS)]
         values = probability[:, 0] if blob == 0 else np.sum(np.where(identity == blob, probability[:, 1:], 0.0), axis=1)
-        there = np.ones(len(time_s), bool) if blob == 0 else np.any(identity == blob, axis=1)
+        is_received = np.ones(len(time_s), bool) if blob == 0 else np.any(identity == blob, axis=1)
         label = "background" if blob == 0 else f"blob {blob}"
-        upper.plot(time_s, np.where(there, values, np.nan), color=colour, label=label, linewidth=1.6)
+        upper.plot(time_s, np.where(is_received, values, np.nan), color=colour, label=label, linewidth=1.6)
         band = (true_blob == blob).tolist()
         upper.fill_between(time_s, 1.03, 1.08, where=band, color=colour, step="mid", linewidth=0)
     upper.set(ylabel="association probability", ylim=(-0.02, 1.1), title=f"{title} (band: true state, where known)")

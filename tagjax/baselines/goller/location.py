@@ -1,4 +1,6 @@
-"""Location of a tag: a probability grid of the floor, updated by the antenna mixture (Goller et al., III.A); velocity."""
+"""Location of a tag: a probability grid of the floor, updated by the antenna mixture (Goller et al., III.A);
+velocity.
+"""
 
 from __future__ import annotations
 
@@ -75,16 +77,18 @@ class Location(eqx.Module):
 
 
 def _blur(axis_m: Float[Array, " cells"], variance_m2: Float[Array, ""]) -> Float[Array, "cells cells"]:
-    """Column j is the distribution of a tag from cell j after a random walk; columns sum to 1: nothing leaves the grid."""
-    apart = jnp.square(axis_m[:, None] - axis_m[None, :])
-    kernel = jnp.exp(-0.5 * apart / (variance_m2 + 1e-9))
+    """Column j is the distribution of a tag from cell j after a random walk; columns sum to 1: nothing leaves the
+    grid.
+    """
+    squared_m2 = jnp.square(axis_m[:, None] - axis_m[None, :])
+    kernel = jnp.exp(-0.5 * squared_m2 / (variance_m2 + 1e-9))
     return kernel / jnp.sum(kernel, axis=0, keepdims=True)
 
 
 class LocationState(eqx.Module):
     """State of a tag's location filter after a frame."""
 
-    belief: Float[Array, "columns rows"]  # sums to 1
+    probability: Float[Array, "columns rows"]  # sums to 1
     mean_m: Float[Array, " 2"]
     velocity_m_s: Float[Array, " 2"]
     known: Bool[Array, ""]
@@ -109,13 +113,14 @@ def locate_step(
     """One frame of the recursive update of III.A, on a grid of the floor.
 
     b_t ~ (G * b_{t-1}) (P(x | z_t) / max P + 1e-6)^h: G a random walk of `walk` times the frame interval, P the mixture
-    of Eq. 1, h = gain times the frame interval, at most 1, since successive observations overlap. Without an observation
-    the distribution only widens. The velocity is the mean's derivative (Eq. 4), low-passed; 0 until the tag was received.
+    of Eq. 1, h = gain times the frame interval, at most 1, since successive observations overlap. Without an
+    observation the distribution only widens. The velocity is the mean's derivative (Eq. 4), low-passed; 0 until the tag
+    was received.
     """
     walk, gain = jnp.exp(model.log_walk_m2_s), jnp.exp(model.log_gain_hz)
-    shape = state.belief.shape
+    shape = state.probability.shape
     any_received = jnp.any(received)
-    predicted = _blur(grid.x_m, walk * elapsed_s) @ state.belief @ _blur(grid.y_m, walk * elapsed_s).T
+    predicted = _blur(grid.x_m, walk * elapsed_s) @ state.probability @ _blur(grid.y_m, walk * elapsed_s).T
     weights = antenna_weights(rssi_dbm, received, jnp.exp(model.log_scale_db))
     likelihood = mixture_likelihood(model.antennas, weights, grid.points()).reshape(shape)
     highest = jnp.max(likelihood)
@@ -123,8 +128,8 @@ def locate_step(
     # The first observation has full weight: it overlaps no earlier one.
     power = jnp.where(state.known, jnp.clip(gain * elapsed_s, 0.0, 1.0), 1.0)
     updated = predicted * jnp.exp(power * jnp.log(relative))
-    belief = updated / jnp.sum(updated)
-    in_x, in_y = jnp.sum(belief, axis=1), jnp.sum(belief, axis=0)
+    probability = updated / jnp.sum(updated)
+    in_x, in_y = jnp.sum(probability, axis=1), jnp.sum(probability, axis=0)
     mean = jnp.stack([jnp.sum(in_x * grid.x_m), jnp.sum(in_y * grid.y_m)])
     variance = jnp.stack(
         [jnp.sum(in_x * jnp.square(grid.x_m - mean[0])), jnp.sum(in_y * jnp.square(grid.y_m - mean[1]))]
@@ -135,7 +140,7 @@ def locate_step(
     velocity = state.velocity_m_s + gain_v * (raw - state.velocity_m_s)
     known = state.known | any_received
     location = Location(mean, jnp.sqrt(variance + 1e-9), velocity, any_received, known)
-    return LocationState(belief, mean, velocity, known), location
+    return LocationState(probability, mean, velocity, known), location
 
 
 def locate(

@@ -56,7 +56,7 @@ def assignment_row(
     """
     wide = jnp.broadcast_to(model.log_speed_m_s, (2,))
     still = _log_gaussian(velocity_m_s, wide)
-    near = jax.vmap(lambda place: _log_gaussian(tag_m - place, model.log_distance_m))(blob_m)
+    near = jax.vmap(lambda position: _log_gaussian(tag_m - position, model.log_distance_m))(blob_m)
     row = jnp.concatenate([still[None], near])
     return jnp.logaddexp(row, jnp.broadcast_to(model.log_clutter, row.shape))
 
@@ -91,9 +91,10 @@ def forward_step(
     """One frame of the HMM's forward filter (Eq. 6): p_t ~ B_t A_t^T p_{t-1}.
 
     `row` is the logarithm of the assignment row, `identity` the blob in each slot, 0 = none. A tag keeps its state with
-    probability exp(-switch * frame interval), otherwise it changes to any other present state with equal probability. The
-    probability of a blob that disappeared, or whose slot another blob took, is distributed evenly over the present
-    states. A frame without an observation only applies the transition. Without any blob the background has probability 1.
+    probability exp(-switch * frame interval), otherwise it changes to any other present state with equal probability.
+    The probability of a blob that disappeared, or whose slot another blob took, is distributed evenly over the present
+    states. A frame without an observation only applies the transition. Without any blob the background has probability
+    1.
     """
     is_present = jnp.concatenate([jnp.ones(1, bool), identity > 0])
     same = jnp.concatenate([jnp.ones(1, bool), (identity > 0) & (identity == state.identity)])

@@ -1,4 +1,6 @@
-"""Goller et al.'s system over a whole recording: observations of both sensors, then location, association and alarms."""
+"""Goller et al.'s system over a whole recording: observations of both sensors, then location, association and
+alarms.
+"""
 
 from __future__ import annotations
 

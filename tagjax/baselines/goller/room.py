@@ -19,7 +19,9 @@ _MAX_ROLL = 0.26  # sine of 15 degrees: the largest roll of a camera that counts
 
 @dataclasses.dataclass(frozen=True)
 class RoomFrame:
-    """Origin on the floor below antenna 1, x from antenna 1 to the last, z up. The rows of `axes` are in camera frame."""
+    """Origin on the floor below antenna 1, x from antenna 1 to the last, z up. The rows of `axes` are in camera
+    frame.
+    """
 
     origin_m: Float[np.ndarray, " 3"]  # camera frame
     axes: Float[np.ndarray, "3 3"]
@@ -56,8 +58,8 @@ class RoomFrame:
 def level_room_frame(antennas_m: Float[np.ndarray, "antennas 3"], antenna_height_m: float) -> RoomFrame:
     """The room frame of a camera mounted level: up is normal to the line of antennas and to the picture's rows.
 
-    `antenna_height_m` is the height of antenna 1 over the floor. Raises `ValueError` for fewer than 2 antennas, for a line
-    of antennas parallel to the rows, and for a height that is not positive.
+    `antenna_height_m` is the height of antenna 1 over the floor. Raises `ValueError` for fewer than 2 antennas, for a
+    line of antennas parallel to the rows, and for a height that is not positive.
     """
     line = np.asarray(antennas_m[-1] - antennas_m[0], np.float64)
     length = np.linalg.norm(line)
@@ -125,7 +127,7 @@ def _floor_inliers(
     has_line = np.linalg.norm(antennas_m[-1] - antennas_m[0]) > 1e-6
     # A line of antennas parallel to the rows makes the test of roll redundant.
     check_roll = abs(ahead @ rows) < 0.9
-    best, most = None, 0
+    best, num_inliers = None, 0
     for _ in range(_NUM_DRAWS if len(points_m) >= 3 else 0):
         a, b, c = points_m[rng.integers(len(points_m), size=3)]
         normal = np.cross(b - a, c - a)
@@ -139,6 +141,6 @@ def _floor_inliers(
         if height < _MIN_HEIGHT_M or tilted:
             continue
         near = np.abs((points_m - a) @ normal) < _TOLERANCE_M
-        if near.sum() > most:
-            best, most = near, int(near.sum())
-    return best if most >= _MIN_INLIERS * len(points_m) else None
+        if near.sum() > num_inliers:
+            best, num_inliers = near, int(near.sum())
+    return best if num_inliers >= _MIN_INLIERS * len(points_m) else None

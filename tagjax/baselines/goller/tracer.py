@@ -43,9 +43,9 @@ class GollerState:
 class GollerTracer(AbstractHostTracer):
     """Calibrated antennas, blobs and association, one frame at a time.
 
-    `room` and `empty` come from an installation at the site, see `install`. Without them the camera is taken to be level,
-    the floor to be `antenna_height_m` below the antennas, and the background is learned from the first frame on. Blobs are
-    located without depth.
+    `room` and `empty` come from an installation at the site, see `install`. Without them the camera is taken to be
+    level, the floor to be `antenna_height_m` below the antennas, and the background is learned from the first frame on.
+    Blobs are located without depth.
     """
 
     def __init__(
@@ -100,7 +100,9 @@ class GollerTracer(AbstractHostTracer):
         )
 
     def step(self, camera: HostCamera, state: GollerState, frame: HostFrame) -> tuple[GollerState, Trace]:
-        """The next state and this frame's `Trace`. Raises `ValueError` where the same state is stepped a second time."""
+        """The next state and this frame's `Trace`. Raises `ValueError` where the same state is stepped a second
+        time.
+        """
         if state.consumed:
             raise ValueError(
                 "This state was stepped already, which changed its background model. Step the newest state."
@@ -125,7 +127,7 @@ class GollerTracer(AbstractHostTracer):
             jnp.asarray(slots.position_m[0]),
             jnp.asarray(slots.identity[0]),
         )
-        places, ranges = self._positions(camera, blobs)
+        positions, ranges = self._positions(camera, blobs)
         detections: list[Detection | None] = []
         for row in np.asarray(probability):
             identity, confidence, slot = _most_probable(row, slots)
@@ -134,7 +136,7 @@ class GollerTracer(AbstractHostTracer):
                 continue
             step_m = ranges[identity] - state.range_m.get(identity, ranges[identity])
             box_px = slots.box_px[0, slot]
-            detections.append(Detection(labels == identity, places[identity], confidence, box_px, step_m))
+            detections.append(Detection(labels == identity, positions[identity], confidence, box_px, step_m))
         identities = tuple(int(one) for one in slots.identity[0])
         after = GollerState(state.tracker, state.grid, reads, location, association, identities, ranges, frame.time_s)
         return after, trace_from_detections(detections, shape)
@@ -156,9 +158,9 @@ class GollerTracer(AbstractHostTracer):
     ) -> tuple[dict[int, Float[np.ndarray, " 3"]], dict[int, float]]:
         """The middle of each blob's person in the camera frame, and its distance to antenna 1."""
         room, middle = self._room(camera), 0.5 * self.settings.blobs.person_height_m
-        places = {blob.identity: room.to_camera(np.append(blob.position_m, middle)[None])[0] for blob in blobs}
-        ranges = {one: float(np.linalg.norm(place - camera.antennas_m[0])) for one, place in places.items()}
-        return places, ranges
+        positions = {blob.identity: room.to_camera(np.append(blob.position_m, middle)[None])[0] for blob in blobs}
+        ranges = {one: float(np.linalg.norm(position - camera.antennas_m[0])) for one, position in positions.items()}
+        return positions, ranges
 
 
 def _most_probable(probability: Float[np.ndarray, " states"], slots: BlobTracks) -> tuple[int, float, int]:

@@ -112,9 +112,9 @@ def fit_association(
 ) -> tuple[Calibration, Float[np.ndarray, " steps"]]:
     """Fit the parameters of location and association (not of the antennas) to recordings of known carriers.
 
-    Gradient descent (Adam) on the alarm loss plus `frame_weight` times the frame loss (see `association_losses`), through
-    the scans of location and HMM. Returns the calibration and the loss at each step. Raises `ValueError` without any read
-    tag.
+    Gradient descent (Adam) on the alarm loss plus `frame_weight` times the frame loss (see `association_losses`),
+    through the scans of location and HMM. Returns the calibration and the loss at each step. Raises `ValueError`
+    without any read tag.
     """
     if not any(observed.epcs for observed, _ in examples):
         raise ValueError(

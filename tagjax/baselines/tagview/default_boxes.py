@@ -31,7 +31,9 @@ def default_boxes(height: int, width: int) -> Float[np.ndarray, "boxes 4"]:
 def encode(
     box_px: Shaped[np.ndarray, "boxes 4"], default_px: Shaped[np.ndarray, "boxes 4"]
 ) -> Float[np.ndarray, "boxes 4"]:
-    """Offsets from default boxes to boxes: shift of the centre in units of the size, logarithm of the ratio of sizes."""
+    """Offsets from default boxes to boxes: shift of the centre in units of the size, logarithm of the ratio of
+    sizes.
+    """
     size = box_size_px(default_px)
     shift = (box_centre_px(box_px) - box_centre_px(default_px)) / size
     return np.concatenate([shift, np.log(box_size_px(box_px) / size)], axis=1) / np.array(_SCALE)
@@ -57,9 +59,9 @@ def targets(
 ) -> tuple[Int[np.ndarray, " boxes"], Float[np.ndarray, "boxes 4"]]:
     """The label of each default box, 1 object, 0 background, -1 ignored; and its offsets, 0 without an object.
 
-    A default box gets the object of highest IoU if that is `min_iou` or more, and every object gets at least the default
-    box of highest IoU (SSD, 2.2). Boxes with an IoU of 0.4 or more with an object, or over 0.1 with an ignored one, are
-    ignored rather than labelled background.
+    A default box gets the object of highest IoU if that is `min_iou` or more, and every object gets at least the
+    default box of highest IoU (SSD, 2.2). Boxes with an IoU of 0.4 or more with an object, or over 0.1 with an ignored
+    one, are ignored rather than labelled background.
     """
     label = np.zeros(len(default_px), np.int64)
     offset = np.zeros((len(default_px), 4))

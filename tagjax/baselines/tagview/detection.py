@@ -1,4 +1,6 @@
-"""Detection of objects in pictures (Tagview, III.A): by the trained network, or by motion against a still background."""
+"""Detection of objects in pictures (Tagview, III.A): by the trained network, or by motion against a still
+background.
+"""
 
 from __future__ import annotations
 

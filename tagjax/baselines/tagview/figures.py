@@ -33,7 +33,9 @@ def pair_plot(path: Path, scores: Sequence[RecordingScore]) -> None:
 
 
 def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> None:
-    """Accuracy by number of tags, one line per setting, slightly shifted so that equal ones are visible, and the paper's."""
+    """Accuracy by number of tags, one line per setting, slightly shifted so that equal ones are visible, and the
+    paper's.
+    """
     figure = blank(5.5, 4.0)
     axes: Axes = figure.subplots()
     for number, (name, values) in enumerate(accuracy.items()):

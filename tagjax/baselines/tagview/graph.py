@@ -52,7 +52,8 @@ def shared_coefficient(
     min_relative_spread: float,
     weight: Float[np.ndarray, "traces tags"] | None = None,
 ) -> Coefficient | None:
-    """Mean and standard deviation of the matched pairs' slopes (V.B), weighted if `weight` is given; None without a match.
+    """Mean and standard deviation of the matched pairs' slopes (V.B), weighted if `weight` is given; None without a
+    match.
 
     `mad` takes the median and 1.48 times the median absolute deviation, which single wrong matches do not affect. The
     spread is at least `min_relative_spread` of the mean: two slopes that agree by chance would prune all others.
@@ -90,8 +91,8 @@ def slope_log_odds(
     """Log likelihood of a pair's slope, nats: -(log(slope / shared) / std)^2 / 2, at least -`MAX_SLOPE_PENALTY_NATS`.
 
     It expresses Observation V.1, that matching pairs share one coefficient, as a likelihood in place of the pruning of
-    Eq. 8. Ours: where slopes of short traces scatter, the z-score accepts half the shared slope as readily as the shared
-    one. A slope that is not positive is an outlier.
+    Eq. 8. Ours: where slopes of short traces scatter, the z-score accepts half the shared slope as readily as the
+    shared one. A slope that is not positive is an outlier.
     """
     ratio = np.maximum(np.asarray(slope, np.float64) / max(shared.mean, 1e-9), 1e-6)
     return np.maximum(-0.5 * np.square(np.log(ratio) / log_slope_std), -MAX_SLOPE_PENALTY_NATS)

@@ -35,10 +35,10 @@ def fit_line(
 ) -> LineFit:
     """Least squares (Eq. 6) and R^2 (Eq. 7) over the valid samples.
 
-    Each piece (0 <= piece < time) has its own intercept, as phases cannot be unwrapped over a gap or a hop; with one piece
-    this is the paper's regression. R^2 is the fraction of the variance within pieces that the line explains. Slope and
-    R^2 are 0 without variance in gamma, R^2 is 0 without variance in phase, and both are 0 where there are no more
-    samples than unknowns, which any line fits. Values and gradients are finite throughout.
+    Each piece (0 <= piece < time) has its own intercept, as phases cannot be unwrapped over a gap or a hop; with one
+    piece this is the paper's regression. R^2 is the fraction of the variance within pieces that the line explains.
+    Slope and R^2 are 0 without variance in gamma, R^2 is 0 without variance in phase, and both are 0 where there are no
+    more samples than unknowns, which any line fits. Values and gradients are finite throughout.
     """
     size = gamma.shape[0]
     weight = valid.astype(gamma.dtype)

@@ -142,10 +142,10 @@ def identify(
 ) -> Identification:
     """Identify the traces. Without traces, tags or a fitting pair all stay unidentified.
 
-    `measured` is at the frames of `traces`. With more tags than traces some tags are not used. With more traces than tags
-    a tag may have several traces that do not overlap; overlapping ones stay unidentified. Equal traces have equal weights;
-    the solver chooses which of them gets a tag. `antenna_m` (camera frame) is used with `origin` antenna only: with the
-    height of the paper's fit, S is measured again from the point below the antenna.
+    `measured` is at the frames of `traces`. With more tags than traces some tags are not used. With more traces than
+    tags a tag may have several traces that do not overlap; overlapping ones stay unidentified. Equal traces have equal
+    weights; the solver chooses which of them gets a tag. `antenna_m` (camera frame) is used with `origin` antenna only:
+    with the height of the paper's fit, S is measured again from the point below the antenna.
     """
     num_traces, num_tags = len(traces.number), measured.sequences.phase_rad.shape[0]
     empty, unidentified = np.zeros((num_traces, num_tags)), np.full(num_traces, -1)

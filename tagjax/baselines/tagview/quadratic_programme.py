@@ -1,4 +1,6 @@
-"""The binary quadratic programme that identifies all traces (Tagview, V.D, Eq. 10), solved to a proven bound by HiGHS."""
+"""The binary quadratic programme that identifies all traces (Tagview, V.D, Eq. 10), solved to a proven bound by
+HiGHS.
+"""
 
 from __future__ import annotations
 
@@ -34,12 +36,13 @@ def select_edges(
 ) -> Selection:
     """max_x x^T Q x + w^T x, x binary, at most one edge of every clique: Eq. 10 with mu within Q.
 
-    Q is symmetric. Its diagonal counts too (Eq. 9 does not define the agreement of an edge with itself; `edge_agreement`
-    sets 0). Each product x_e x_f of compatible edges becomes a variable y_ef, 0 to 1. For an edge e and a clique K without
-    it, x_e times "at most one of K" gives sum_{f in K} y_ef <= x_e: this relaxation is far tighter than y_ef <= x_e for
-    each f, and its solution is mostly integral at the root. Where Q is negative, y_ef >= x_e + x_f - 1. HiGHS ends at the
-    optimum, or at the time limit with a proven bound; in the worst case nothing is chosen and the bound is the sum of all
-    positive terms. Raises `ValueError` for a Q that is not symmetric or not finite.
+    Q is symmetric. Its diagonal counts too (Eq. 9 does not define the agreement of an edge with itself;
+    `edge_agreement` sets 0). Each product x_e x_f of compatible edges becomes a variable y_ef, 0 to 1. For an edge e
+    and a clique K without it, x_e times "at most one of K" gives sum_{f in K} y_ef <= x_e: this relaxation is far
+    tighter than y_ef <= x_e for each f, and its solution is mostly integral at the root. Where Q is negative, y_ef >=
+    x_e + x_f - 1. HiGHS ends at the optimum, or at the time limit with a proven bound; in the worst case nothing is
+    chosen and the bound is the sum of all positive terms. Raises `ValueError` for a Q that is not symmetric or not
+    finite.
     """
     weight, quadratic = np.asarray(weight, np.float64), np.asarray(quadratic, np.float64)
     num = len(weight)

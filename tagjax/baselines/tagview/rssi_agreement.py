@@ -19,11 +19,11 @@ def agreement(
 ) -> Float[Array, "traces traces tags tags"]:
     """[k, l, i, j]: agreement of tags i and j on traces k and l, in [0, 1]; 1/2 is no evidence either way.
 
-    The paper sets x_p = [r_i > r_j], y_p = [S_k > S_l] and takes the mean of x xor y, which counts where they differ: the
-    stronger tag is the *nearer* one, so for right pairs x_p = 1 coincides with y_p = 0. Two details differ from the
+    The paper sets x_p = [r_i > r_j], y_p = [S_k > S_l] and takes the mean of x xor y, which counts where they differ:
+    the stronger tag is the *nearer* one, so for right pairs x_p = 1 coincides with y_p = 0. Two details differ from the
     printed text. Where r_i = r_j (RSSI comes in steps of 0.5 dB) x is 0 both for (i, j) and for (j, i), which makes the
-    measure depend on the order of the edges; here a tie counts one half. And the second vector is printed with S_i, S_j,
-    where the traces k, l are meant. With signs,
+    measure depend on the order of the edges; here a tie counts one half. And the second vector is printed with S_i,
+    S_j, where the traces k, l are meant. With signs,
 
         agreement = mean of (1 - sgn(r_i - r_j) sgn(S_k - S_l)) / 2
 

@@ -78,8 +78,8 @@ def tag_measurements(
 ) -> TagMeasurements:
     """Sequences of the tags at the frames, in the order of `epcs`; a tag that was not read has no known sample.
 
-    For readers that hop, phi = 4 pi f d / c + c0 + s (f - f0). The slope s, together with the slope of the mean distance,
-    is estimated at the hops (median over tags) and subtracted.
+    For readers that hop, phi = 4 pi f d / c + c0 + s (f - f0). The slope s, together with the slope of the mean
+    distance, is estimated at the hops (median over tags) and subtracted.
     """
     usable = usable_reads(reads, settings.antenna)
     reads, read_time_s = reads[usable], np.asarray(read_time_s, np.float64)[usable]
@@ -120,7 +120,9 @@ def tag_measurements(
 
 
 def _has_pi_flips(reads: TagReads, columns: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> bool:
-    """Whether the reader's phases have pi flips: its own statement, or the median over tags of (phase, time, channel)."""
+    """Whether the reader's phases have pi flips: its own statement, or the median over tags of (phase, time,
+    channel).
+    """
     if reads.pi_flips is not None:
         return bool(reads.pi_flips)
     fractions = [pi_flip_share(*one) for one in columns]

@@ -38,9 +38,9 @@ def pieces(
 ) -> Int[Array, " reads"]:
     """The number of each read's piece, from 0; within a piece the phase has one constant offset.
 
-    A new piece begins after a gap of more than `max_gap_s`, over which unwrapping is unreliable, and, if `break_at_hops`,
-    where the channel changes, since every channel has its own phase offset. Reads that are not valid belong to the piece
-    before them.
+    A new piece begins after a gap of more than `max_gap_s`, over which unwrapping is unreliable, and, if
+    `break_at_hops`, where the channel changes, since every channel has its own phase offset. Reads that are not valid
+    belong to the piece before them.
     """
     last = _last_valid(valid)
     at = jnp.maximum(last, 0)

@@ -185,10 +185,11 @@ class TagviewTracer(AbstractHostTracer):
         )
 
     def _depth_m(self, state: TagviewState, antenna_m: Shaped[np.ndarray, " 3"]) -> float:
-        """The plane's depth before the camera: the known height, or the one of the shared slope (a = 4 pi h / wavelength).
+        """The plane's depth before the camera: the known height, or the one of the shared slope (a = 4 pi h /
+        wavelength).
 
-        Identification needs only that all slopes agree, and the paper uses nothing else of them. As a length the slope is
-        inaccurate: where distances change by 0.1 m, multipath of 0.3 rad changes it by a tenth and more.
+        Identification needs only that all slopes agree, and the paper uses nothing else of them. As a length the slope
+        is inaccurate: where distances change by 0.1 m, multipath of 0.3 rad changes it by a tenth and more.
         """
         known = self.settings.height_m
         return state.height_m + float(antenna_m[2]) if known is None else known

@@ -61,7 +61,9 @@ class LabelledFrame:
 
 
 def labelled_frames(recording: Recording, *, stride: int = 1, min_side_px: float = 5.0) -> list[LabelledFrame]:
-    """Every `stride`-th frame with the boxes of its tagged objects. Raises `ValueError` for a recording without truth."""
+    """Every `stride`-th frame with the boxes of its tagged objects. Raises `ValueError` for a recording without
+    truth.
+    """
     truth = recording.truth
     if truth is None or truth.boxes_px is None or not truth.tag_to_label:
         raise ValueError(
@@ -84,7 +86,9 @@ def detection_loss(
     offsets: Float[Array, "batch boxes 4"],
     negatives: float,
 ) -> Float[Array, ""]:
-    """SSD's loss (Liu et al., Eq. 1): cross entropy of positives and the hardest negatives, smooth L1 of the offsets."""
+    """SSD's loss (Liu et al., Eq. 1): cross entropy of positives and the hardest negatives, smooth L1 of the
+    offsets.
+    """
     log_odds, predicted = jax.vmap(network)(images)
     positive = labels == 1
     number = jnp.maximum(jnp.sum(positive), 1).astype(log_odds.dtype)
@@ -104,7 +108,9 @@ def train_detector(
     *,
     on_step: Callable[[int, float], None] | None = None,
 ) -> tuple[BoxNetwork, dict[str, Any]]:
-    """A network trained on labelled frames, and the settings with the last losses. Raises `ValueError` without a frame."""
+    """A network trained on labelled frames, and the settings with the last losses. Raises `ValueError` without a
+    frame.
+    """
     if not frames:
         raise ValueError("No frame to train on, expected labelled frames. Simulate the train split of a suite.")
     rng = np.random.default_rng(settings.seed)
@@ -201,8 +207,8 @@ def _crop_boxes(
 
 
 def measure_detector(detector: AbstractDetector, frames: Sequence[LabelledFrame]) -> dict[str, float]:
-    """Precision and recall of detections (each of at most one object, IoU at least `CORRECT_IOU`), and the mean distance of
-    correct ones from the objects' centres, px. Detections of ignored boxes do not count.
+    """Precision and recall of detections (each of at most one object, IoU at least `CORRECT_IOU`), and the mean
+    distance of correct ones from the objects' centres, px. Detections of ignored boxes do not count.
     """
     correct = detected = expected = 0
     errors: list[float] = []

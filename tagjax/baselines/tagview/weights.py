@@ -24,7 +24,9 @@ _FILE = ArraysFile(
 
 
 def save_weights(path: str | Path, network: BoxNetwork, about: Mapping[str, Any]) -> None:
-    """Write a network in half precision; `about` holds `network` (its settings), and may hold training settings and scores."""
+    """Write a network in half precision; `about` holds `network` (its settings), and may hold training settings and
+    scores.
+    """
     if not isinstance(about.get("network"), Mapping):
         raise ValueError(f"about holds {sorted(about)}; expected `network`, the settings of the network.")
     _FILE.write(path, network, about, half=True)

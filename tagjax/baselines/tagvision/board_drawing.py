@@ -40,7 +40,9 @@ class LocatedBoard:
 def draw_boards(
     boards: Sequence[tuple[LocatedBoard, UInt8[np.ndarray, "_ _ 3"]]],
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Panels side by side, in as many rows as columns: each picture with corners, first corner and axes of two squares."""
+    """Panels side by side, in as many rows as columns: each picture with corners, first corner and axes of two
+    squares.
+    """
     panels = [_panel(board, picture) for board, picture in boards]
     columns = math.ceil(math.sqrt(len(panels)))
     height = max(panel.shape[0] for panel in panels)
@@ -88,11 +90,11 @@ def _panel(board: LocatedBoard, picture: UInt8[np.ndarray, "_ _ 3"]) -> UInt8[np
 
 
 def _write(
-    picture: np.ndarray, text: str, place: tuple[int, ...], colour: Colour, size: float, *, centred=False
+    picture: np.ndarray, text: str, position: tuple[int, ...], colour: Colour, size: float, *, centred=False
 ) -> None:
     text = text.encode("ascii", "replace").decode()  # OpenCV has no other glyphs
     (width, height), _ = cv2.getTextSize(text, _FONT, size, 1)
-    x, y = (place[0] - width // 2, place[1] + height // 2) if centred else (place[0], place[1])
+    x, y = (position[0] - width // 2, position[1] + height // 2) if centred else (position[0], position[1])
     if centred:
         cv2.putText(picture, text, (x, y), _FONT, size, _PAPER, 5, cv2.LINE_AA)
     cv2.putText(picture, text, (x, y), _FONT, size, colour, 1, cv2.LINE_AA)

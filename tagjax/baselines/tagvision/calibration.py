@@ -89,8 +89,9 @@ def calibrate(
 ) -> CameraCalibration:
     """Intrinsics with distortion from the corners seen in several pictures of the board (Zhang's method).
 
-    `num_radial`: 2 fits the paper's k1 and k2; 3 also fits k3 and the tangential terms; 0 assumes an ideal lens. Raises `CalibrationError` for too few views, a wrong number of corners, corners outside the picture,
-    or boards that are all parallel.
+    `num_radial`: 2 fits the paper's k1 and k2; 3 also fits k3 and the tangential terms; 0 assumes an ideal lens. Raises
+    `CalibrationError` for too few views, a wrong number of corners, corners outside the picture, or boards that are all
+    parallel.
     """
     if num_radial not in (0, 2, 3):
         raise ValueError(f"num_radial is {num_radial}; expected 0, 2 or 3.")

@@ -1,4 +1,6 @@
-"""Detection of moving blobs by optical flow (TagVision, III.A): dense or Lucas-Kanade, with limits on size and speed."""
+"""Detection of moving blobs by optical flow (TagVision, III.A): dense or Lucas-Kanade, with limits on size and
+speed.
+"""
 
 from __future__ import annotations
 
@@ -76,9 +78,11 @@ class Blob:
 def backward_flow(
     now: UInt8[np.ndarray, "height width"], before: UInt8[np.ndarray, "height width"], flow: FlowName = "farneback"
 ) -> Float[np.ndarray, "height width 2"]:
-    """The displacement of each pixel of `now` since `before` (I(x, t) = I(x + a, t + dt), Eq. 1): forward in time, pixels.
+    """The displacement of each pixel of `now` since `before` (I(x, t) = I(x + a, t + dt), Eq. 1): forward in time,
+    pixels.
 
-    "farneback" and "dis" are dense; "lucas_kanade" tracks corners, whose flow the pixels around them take (0 elsewhere).
+    "farneback" and "dis" are dense; "lucas_kanade" tracks corners, whose flow the pixels around them take (0
+    elsewhere).
     """
     if flow == "lucas_kanade":
         return _corner_flow(now, before)

@@ -1,4 +1,6 @@
-"""Which track carries which tag (TagVision, IV.B-C): reads are paired with positions and scored; the best score wins."""
+"""Which track carries which tag (TagVision, IV.B-C): reads are paired with positions and scored; the best score
+wins.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ _PAD_TRACKS = 8
 
 @dataclasses.dataclass(frozen=True)
 class MatchSettings:
-    """The defaults are the paper's where it gives them; additions to the paper are marked ours and disabled by default."""
+    """The defaults are the paper's where it gives them; additions to the paper are marked ours and disabled by
+    default.
+    """
 
     reference: Reference = "first"
     num_snapshots: int = 30
@@ -86,8 +90,8 @@ def match_tags(
     """Score every tag against the paths (NaN where not seen) and choose for each the highest, m = argmax s_i.
 
     Paths and antenna are in one frame whose z is up. A tag without reads, or without paths, has `NO_MATCH`. Of equal
-    scores the lower number is chosen. Several tags may get the same path, unless `exclusive`: then those that gain least
-    get none. A path may get no tag.
+    scores the lower number is chosen. Several tags may get the same path, unless `exclusive`: then those that gain
+    least get none. A path may get no tag.
     """
     numbers = sorted(paths_m)
     if not numbers:
@@ -112,7 +116,9 @@ def _tag_positions(
 
 
 def _without_gaps(direction: Float[np.ndarray, "frames 3"]) -> Float[np.ndarray, "frames 3"]:
-    """The last direction of motion where an object stands still, or the first one to come; zero where it never moves."""
+    """The last direction of motion where an object stands still, or the first one to come; zero where it never
+    moves.
+    """
     known = np.flatnonzero(np.isfinite(direction[:, 0]))
     if not len(known):
         return np.zeros_like(direction)

@@ -28,7 +28,8 @@ def pair_nearest(
     *,
     max_gap_s: float = float("inf"),
 ) -> tuple[Int[np.ndarray, " frames"], Float[np.ndarray, "frames 3"], Bool[np.ndarray, " frames"]]:
-    """The paper's pairing: reads frame with its nearest read. Returns read indices, positions, and which pairs are valid.
+    """The paper's pairing: reads frame with its nearest read. Returns read indices, positions, and which pairs are
+    valid.
 
     Pairs farther apart in time than `max_gap_s`, and frames without a position (NaN), are not valid.
     """

@@ -45,12 +45,12 @@ def phase_score(
 ) -> Float[Array, ""]:
     """s = |sum_j w_j exp(J theta_j)| / N, w_j = f(theta_j; 0, sigma) / f(0; 0, sigma), in [0, 1] (IV.C, Algorithm 1).
 
-    `residual_rad` is the measured minus the theoretical phase of each snapshot. theta_j is the residual minus that of the
-    first counted snapshot ("first": the diversity term cancels), or the residual itself ("absolute": the term is known
-    and already subtracted), wrapped to [-pi, pi). The paper's weight is the density f itself: a constant factor. With
-    `angle_multiple` 2 residuals are compared modulo pi, which makes the score invariant to pi flips. The score is 0
-    without a counted snapshot, and with a single one as its own reference. It is differentiable in the residuals; those
-    that do not count may have any value, NaN included.
+    `residual_rad` is the measured minus the theoretical phase of each snapshot. theta_j is the residual minus that of
+    the first counted snapshot ("first": the diversity term cancels), or the residual itself ("absolute": the term is
+    known and already subtracted), wrapped to [-pi, pi). The paper's weight is the density f itself: a constant factor.
+    With `angle_multiple` 2 residuals are compared modulo pi, which makes the score invariant to pi flips. The score is
+    0 without a counted snapshot, and with a single one as its own reference. It is differentiable in the residuals;
+    those that do not count may have any value, NaN included.
     """
     dtype = residual_rad.dtype
     if reference not in ("first", "absolute"):
@@ -84,12 +84,13 @@ def draw_snapshots(
 
 
 def residuals_rad(snapshots: Snapshots, hop_slope_rad_hz: Float[Array, ""]) -> Float[Array, "candidates snapshots"]:
-    """Measured minus theoretical phase, for each candidate, with the reader's affine phase offset over channels subtracted.
+    """Measured minus theoretical phase, for each candidate, with the reader's affine phase offset over channels
+    subtracted.
 
     `hop_slope_rad_hz` is the sum of the reader's slope and that of the mean distance, 4 pi d / c, as the hops show it.
     The theoretical phase at f - f0 from the mean carrier f0 is therefore 4 pi / c (f - f0) times the deviation from the
-    candidate's mean distance. With slope NaN the theoretical phase uses each read's own carrier and no offset (the paper
-    does not mention hopping).
+    candidate's mean distance. With slope NaN the theoretical phase uses each read's own carrier and no offset (the
+    paper does not mention hopping).
     """
     known = jnp.any(snapshots.valid, axis=0)
     dtype = snapshots.phase_rad.dtype

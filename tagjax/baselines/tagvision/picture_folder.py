@@ -151,7 +151,7 @@ def _make_folder(out: Path) -> None:
 def _pose(
     poses: Sequence[PosePicture], board: Board, camera: CameraCalibration, shape: tuple[int, int]
 ) -> tuple[PlaneCamera, tuple[LocatedBoard, ...]]:
-    places: list[Float[np.ndarray, "corners 3"]] = []
+    points_m: list[Float[np.ndarray, "corners 3"]] = []
     pixels: list[Float[np.ndarray, "corners 2"]] = []
     for pose in poses:
         picture = read_picture(pose.picture)
@@ -167,7 +167,7 @@ def _pose(
             )
         c, s = np.cos(np.radians(pose.turn_deg)), np.sin(np.radians(pose.turn_deg))
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        places.append(board.corners_m() @ turn.T + np.array([*pose.origin_m, 0.0]))
+        points_m.append(board.corners_m() @ turn.T + np.array([*pose.origin_m, 0.0]))
         pixels.append(corners)
     # Corners may be found from either end of the board; the order on which several positions agree is the right one.
     best: PlaneCamera | None = None
@@ -175,7 +175,7 @@ def _pose(
     for reversals in _reversals(len(poses)):
         turned = [seen[::-1] if reverse else seen for seen, reverse in zip(pixels, reversals, strict=True)]
         try:
-            found = camera_pose(np.concatenate(places), np.concatenate(turned), camera.intrinsics)
+            found = camera_pose(np.concatenate(points_m), np.concatenate(turned), camera.intrinsics)
         except CalibrationError:
             continue
         if best is None or found.reprojection_px < best.reprojection_px:
@@ -183,9 +183,9 @@ def _pose(
     if best is None:
         raise CalibrationError("No pose explains the pictures of the board on the plane. Check origin_m and turn_deg.")
     boards = []
-    for pose, place, corners in zip(poses, places, order, strict=True):
-        error_px = float(np.sqrt(np.mean(np.sum((best.to_picture(place) - corners) ** 2, axis=1))))
-        x, y = float(place[0, 0]), float(place[0, 1])
+    for pose, board_m, corners in zip(poses, points_m, order, strict=True):
+        error_px = float(np.sqrt(np.mean(np.sum((best.to_picture(board_m) - corners) ** 2, axis=1))))
+        x, y = float(board_m[0, 0]), float(board_m[0, 1])
         boards.append(LocatedBoard(pose.picture, corners, best, (x, y), board, error_px))
     return best, tuple(boards)
 

@@ -1,4 +1,6 @@
-"""TagVision as a host tracer: blobs, tracks, positions on the plane, and for each tag the track of highest phase score."""
+"""TagVision as a host tracer: blobs, tracks, positions on the plane, and for each tag the track of highest phase
+score.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ class TagVisionState:
 
 
 class TagVisionTracer(AbstractHostTracer):
-    """Duan et al., INFOCOM 2017. `camera` is the calibration; the tagged objects move on a plane `height_m` above it."""
+    """Duan et al., INFOCOM 2017. `camera` is the calibration; the tagged objects move on a plane `height_m` above
+    it.
+    """
 
     def __init__(self, camera: PlaneCamera | None, settings: TagVisionSettings | None = None):
         self.camera = camera

@@ -85,7 +85,8 @@ def track_blobs(
     time_s: float,
     settings: TrackSettings,
 ) -> Tracks:
-    """The tracks at the next frame: mean shift moves every track, blobs correct it, blobs without a track begin new ones.
+    """The tracks at the next frame: mean shift moves every track, blobs correct it, blobs without a track begin new
+    ones.
 
     A blob near the end of a track's mean shift, of similar size, gives position and outline. Where blobs merge, or an
     object stands still and has none, mean shift alone gives them.

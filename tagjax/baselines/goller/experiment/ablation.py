@@ -1,4 +1,6 @@
-"""Which sensor misses what: the same rule with true positions of tags, true blobs, or both in place of measured ones."""
+"""Which sensor misses what: the same rule with true positions of tags, true blobs, or both in place of measured
+ones.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""How the association follows a tag from person to person (Goller et al., Fig. 7): probabilities by role, and delays."""
+"""How the association follows a tag from person to person (Goller et al., Fig. 7): probabilities by role, and
+delays.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,8 @@ def find_handover(
 ) -> Handover | None:
     """The hand-over in a recording in which one person carries a tag, then another, then nobody.
 
-    The blob nearest to the moving tag carries it. Every blob belongs to the role that it has in most frames, as a person
-    may be more than one blob in turn. None where no two blobs carry the tag.
+    The blob nearest to the moving tag carries it. Every blob belongs to the role that it has in most frames, as a
+    person may be more than one blob in turn. None where no two blobs carry the tag.
     """
     times = np.asarray(time_s, np.float64)
     speed = np.linalg.norm(np.gradient(np.asarray(path_m, np.float64), times, axis=0), axis=1)

@@ -1,4 +1,6 @@
-"""Goller et al.'s experiments: calibrate, train, choose thresholds, count; writes tables, metrics and plots to a folder."""
+"""Goller et al.'s experiments: calibrate, train, choose thresholds, count; writes tables, metrics and plots to a
+folder.
+"""
 
 from __future__ import annotations
 

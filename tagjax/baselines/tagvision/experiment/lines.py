@@ -60,7 +60,8 @@ class LineScores:
 
 
 def line_scores(settings: LineSettings) -> LineScores:
-    """Score 101 lines 6 mm apart, the middle one with the tag (Fig. 6), with the "absolute" or the "first" sample's phase as reference.
+    """Score 101 lines 6 mm apart, the middle one with the tag (Fig. 6), with known phases
+    ("absolute") or the first sample's phase ("first") as reference.
 
     Straight lines and their phases are `sim.planar`'s. With the first sample as reference an unknown constant is added
     to every round's phases, as a real reader does.
@@ -84,10 +85,10 @@ def line_scores(settings: LineSettings) -> LineScores:
         x, y = settings.circle_m * np.cos(angle), settings.circle_m * np.sin(angle)
     # (lines, rounds, samples, 3): every line has the same samples.
     across = drawn.line_m[:, None, None] + x[None]
-    place = np.stack([across, np.broadcast_to(y, across.shape), np.zeros_like(across)], axis=-1)
+    position = np.stack([across, np.broadcast_to(y, across.shape), np.zeros_like(across)], axis=-1)
     antenna = jnp.asarray((*settings.antenna_m, 0.0), jnp.float32)
     carrier = jnp.full(across.shape, drawn.carrier_hz, jnp.float32)
-    theory = theory_rad(jnp.asarray(place, jnp.float32), antenna, carrier)
+    theory = theory_rad(jnp.asarray(position, jnp.float32), antenna, carrier)
     if settings.circle_m is not None:
         rng = np.random.default_rng([settings.seed, 1])
         phase = np.asarray(theory[drawn.true_line]) + settings.noise_rad * rng.normal(size=y.shape)

@@ -38,11 +38,11 @@ def board_views(
     while len(views) < settings.num_views:
         distance = camera.fx_px * size_m / (rng.uniform(0.25, 0.6) * camera.height)
         reach = np.array([camera.width / camera.fx_px, camera.height / camera.fy_px]) * distance * 0.5
-        place = np.array([*rng.uniform(-reach, reach), distance])
+        position = np.array([*rng.uniform(-reach, reach), distance])
         tilt = rng.uniform(-0.7, 0.7, 2)
         about_z = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
         rotation = Rotation.from_euler("x", np.pi + tilt[0]) * Rotation.from_euler("y", tilt[1]) * about_z
-        seen = PlaneCamera(camera, rotation.as_matrix(), place).to_picture(centred)
+        seen = PlaneCamera(camera, rotation.as_matrix(), position).to_picture(centred)
         seen = seen + settings.corner_noise_px * rng.normal(size=seen.shape)
         if np.all(seen >= 0) and np.all(seen <= [camera.width - 1, camera.height - 1]):
             views.append(seen)
