@@ -109,9 +109,9 @@ def test_the_comparison_takes_each_system_as_its_own_experiments_do() -> None:
     assert systems["tagvision_calibration"] == vision["calibration"]
     assert systems["tagview"] == view["system"]
     assert systems["goller"] == _compose("goller")["settings"]
-    # What is claimed on the way is one of the settings that are compared on the same tracks.
+    # The online detections use one of the settings that are compared on the same tracks.
     assert vision["matching"]["adapted"] == vision["system"]["match"]
-    assert view["matching"][view["whole"]] == {name: view["system"][name] for name in ("reads", "match")}
+    assert view["matching"][view["main"]] == {name: view["system"][name] for name in ("reads", "match")}
     whole = from_mapping(MatchSettings, view["system"]["match"])
     for name, change in (("no_rssi", {"mu": 0.0}), ("camera_origin", {"origin": "principal"})):
         assert from_mapping(MatchSettings, view["matching"][name]["match"]) == dataclasses.replace(whole, **change)
