@@ -18,7 +18,12 @@ from .command import checked, command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
-    from tagjax.baselines.tagvision import CalibrateSettings, calibrate_folder, write_calibration, write_corners
+    from tagjax.baselines.tagvision.picture_folder import (
+        CalibrateSettings,
+        calibrate_folder,
+        write_calibration,
+        write_corners,
+    )
 
     if values["pictures"] is None:
         raise ValueError("found no pictures; expected pictures=<folder of pictures of the checkerboard>.")
@@ -26,11 +31,11 @@ def main(values: dict[str, Any], folder: Path) -> None:
     calibration = calibrate_folder(settings)
     write_calibration(calibration, settings.out)
     drawn = write_corners(calibration, settings.out)
-    warning = (
-        f"a board looks the same from either end: {drawn} shows the first corner and the axes. Where the other end was "
-        "meant, give that corner's position as origin_m and add 180 to turn_deg."
+    hint = (
+        f"a board looks the same from either end: {drawn} shows the first corner and the axes. If you meant the other end, "
+        "give that corner's position as origin_m and add 180 to turn_deg."
     )
-    for line in (*calibration.said(), *([warning] if settings.poses else []), f"written to {settings.out} and {drawn}"):
+    for line in (*calibration.summary(), *([hint] if settings.poses else []), f"written to {settings.out} and {drawn}"):
         console.print(line, markup=False)
 
 

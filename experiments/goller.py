@@ -2,7 +2,7 @@
 
 python -m experiments.simulate suite=shop_grid         # and shop_exit, shop_handover
 python -m experiments.goller
-python -m experiments.goller handover=<recording>      # in place of those of shop_handover beside the scenarios
+python -m experiments.goller handover=<recording>      # instead of those of shop_handover beside the scenarios
 python -m experiments.goller scenarios=<folder of the suite> max_recordings=3 fit_steps=0
 """
 
@@ -18,12 +18,12 @@ from .command import checked, command, print_result
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
-    from tagjax.evaluation.goller import GollerConfig, run_goller
+    from tagjax.baselines.goller.experiment import GollerExperiment, run_goller
     from tagjax.recording.store import open_recording
 
-    config, console = checked(GollerConfig, values, folder), Console()
+    config, console = checked(GollerExperiment, values, folder), Console()
     with console.status("tracking", spinner="line") as status:
-        metrics = run_goller(config, open_recording, folder, on_done=lambda name: status.update(f"tracked {name}"))
+        metrics = run_goller(config, folder, open_recording=open_recording, on_progress=status.update)
     console.print((folder / "tables.md").read_text(), markup=False)
     if metrics["handover"] is None:
         hint = "found no hand-over; `python -m experiments.simulate suite=shop_handover` makes recordings of some"

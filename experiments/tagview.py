@@ -1,4 +1,4 @@
-"""Tagview's experiments on simulated suites: identified toy trains, tables and plots; or its detector trained.
+"""Tagview's experiments on simulated suites: identification, tables and plots; or the training of its detector.
 
 python -m experiments.simulate suite=ceiling_2         # and ceiling_3 to ceiling_6, separated_traces, half_wavelength
 python -m experiments.tagview
@@ -22,26 +22,26 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from rich.markdown import Markdown
     from rich.progress import Progress
 
-    from tagjax.evaluation.tagview import TagviewExperiment, run_tagview, table, train_tagview
+    from tagjax.baselines.tagview.experiment import TagviewExperiment, report_markdown, run_tagview, train_tagview
 
-    asked, progress = values.pop("command"), values.pop("progress")
-    if asked not in ("run", "train"):
-        raise ValueError(f"command is {asked!r}; expected run or train.")
+    command_name, progress = values.pop("command"), values.pop("progress")
+    if command_name not in ("run", "train"):
+        raise ValueError(f"command is {command_name!r}; expected run or train.")
     suites_named(values["suites"])
     config, console = checked(TagviewExperiment, values, folder), Console()
-    write_config({"command": asked, **values}, folder)
+    write_config({"command": command_name, **values}, folder)
     with Progress(console=console, disable=not progress) as bar:
         task = bar.add_task("tagview", total=None)
 
         def report(name: str, number: int, total: int) -> None:
             bar.update(task, completed=number, total=total, description=name)
 
-        if asked == "train":
-            steps = config.training.recipe.num_steps
+        if command_name == "train":
+            steps = config.training.settings.num_steps
             metrics = train_tagview(config, folder, on_step=lambda step, loss: report(f"loss {loss:.3f}", step, steps))
         else:
             metrics = run_tagview(config, folder, on_progress=report)
-            console.print(Markdown(table(metrics)))
+            console.print(Markdown(report_markdown(metrics)))
     console.print(f"run folder: {folder}", soft_wrap=True, highlight=False)
     print_result(metrics)
 

@@ -18,13 +18,13 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    from tagjax.evaluation.tagvision import TagVisionExperiment, run_tagvision, table
+    from tagjax.baselines.tagvision.experiment import TagVisionExperiment, report_markdown, run_tagvision
 
     progress, console = values.pop("progress"), Console()
     config = checked(TagVisionExperiment, values, folder)
     with console.status("TagVision") as status:
         metrics = run_tagvision(config, folder, on_progress=status.update if progress else None)
-    console.print(Markdown(table(metrics)))
+    console.print(Markdown(report_markdown(metrics)))
     console.print(f"plots, table.md and metrics.json in {folder}", soft_wrap=True, highlight=False)
     print_result(metrics)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tagjax.evaluation.tagvision import overhead
+from tagjax.baselines.tagvision.experiment.simulated_calibration import overhead
 from tagjax.recording import Intrinsics, Recording, TagReads, Truth
 
 C = 299_792_458.0

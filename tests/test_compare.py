@@ -19,14 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.suites import suites_named
-from tagjax.baselines.goller import (
-    AntennaModel,
-    Calibration,
-    GollerTracer,
-    make_association,
-    make_location,
-    save_calibration,
-)
+from tagjax.baselines.goller import Calibration, GollerTracer, save_calibration
+from tagjax.baselines.goller.antennas import AntennaModel
+from tagjax.baselines.goller.location import make_location
+from tagjax.baselines.goller.matching import make_association
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
 from tagjax.evaluation.compare._run import _score, _Tally
@@ -170,7 +166,7 @@ def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPa
     save_calibration(Calibration(location, association, jnp.asarray(0.4), jnp.asarray(-60.0)), tmp_path / "c.json")
     config = _config(["shop_exit"])
     settings = dataclasses.replace(config.systems, goller_calibration=str(tmp_path / "c.json"), goller_grid=None)
-    monkeypatch.setattr(GollerTracer, "at", lambda self, _: self)
+    monkeypatch.setattr(GollerTracer, "install", lambda self, _: self)
     recording = dataclasses.replace(synthetic.recording(4), antennas_m=np.zeros((num, 3)))
     systems = Systems(settings, config.scores)
     found = systems._goller(recording).calibration

@@ -18,15 +18,15 @@ from hydra.plugins.sweeper import Sweeper
 from omegaconf import OmegaConf
 
 from experiments.suites import suites_named
-from tagjax.baselines.tagview import MatchSettings
+from tagjax.baselines.goller.experiment import GollerExperiment
+from tagjax.baselines.tagview.experiment import TagviewExperiment
+from tagjax.baselines.tagview.matching import MatchSettings
 from tagjax.core.build import build
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import SystemSettings
 from tagjax.evaluation.flow import FlowEvaluationSettings
-from tagjax.evaluation.goller import GollerConfig
 from tagjax.evaluation.run import EvaluateConfig
 from tagjax.evaluation.sweep import SweepConfig
-from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.sim.suites import PLANAR, Suite
@@ -112,7 +112,7 @@ def test_flow_evaluation_configurations_are_valid() -> None:
     assert settings(FlowEvaluationSettings, "evaluate_flow").flows
 
 
-@pytest.mark.parametrize(("name", "schema"), [("goller", GollerConfig), ("tagview", TagviewExperiment)])
+@pytest.mark.parametrize(("name", "schema"), [("goller", GollerExperiment), ("tagview", TagviewExperiment)])
 def test_configurations_of_the_earlier_systems_are_valid(name: str, schema: type) -> None:
     assert settings(schema, name)
     fields = {field.name for field in dataclasses.fields(schema)}
@@ -126,9 +126,9 @@ def test_the_comparison_takes_each_system_as_its_own_experiments_do() -> None:
     assert systems["tagvision_calibration"] == vision["calibration"]
     assert systems["tagview"] == view["system"]
     assert systems["goller"] == composed("goller")["settings"]
-    # The system's own matching is among the settings that are compared on the same tracks.
+    # The online detections use one of the settings that are compared on the same tracks.
     assert vision["matching"]["adapted"] == vision["system"]["match"]
-    assert view["matching"][view["complete"]] == {name: view["system"][name] for name in ("reads", "match")}
+    assert view["matching"][view["main"]] == {name: view["system"][name] for name in ("reads", "match")}
     complete = from_mapping(MatchSettings, view["system"]["match"])
     for name, change in (("no_rssi", {"mu": 0.0}), ("camera_origin", {"origin": "principal"})):
         assert from_mapping(MatchSettings, view["matching"][name]["match"]) == dataclasses.replace(complete, **change)

@@ -14,11 +14,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override
 from omegaconf import OmegaConf
 
+from tagjax.baselines.goller.experiment import GollerExperiment
+from tagjax.baselines.tagview.experiment import TagviewExperiment
 from tagjax.core.settings import from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
-from tagjax.evaluation.goller import GollerConfig
 from tagjax.evaluation.run import EvaluateConfig
-from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.sim.suites import SimulateConfig
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_config import TrainFlowConfig
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 SCHEMAS: dict[str, type] = {
     "evaluate": EvaluateConfig,
     "evaluate_flow": FlowEvaluationSettings,
-    "goller": GollerConfig,
+    "goller": GollerExperiment,
     "simulate": SimulateConfig,
     "tagview": TagviewExperiment,
     "train": TrainConfig,

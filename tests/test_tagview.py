@@ -11,33 +11,24 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.stats import norm
 
-from tagjax.baselines.tagview import (
-    SLOPE_OUTLIER_NATS,
+from tagjax.baselines.tagview.graph import (
+    MAX_SLOPE_PENALTY_NATS,
     Coefficient,
-    Heard,
-    MatchSettings,
-    ReadSettings,
-    TagSequences,
-    Traces,
-    agreement,
     cliques,
     edge_agreement,
-    fit_line,
-    fit_pairs,
-    hear,
-    identify,
-    interpolate,
     keep_edges,
     likelihood_weight,
     match_graph,
-    pieces,
-    select_edges,
     shared_coefficient,
-    shared_times,
     slope_log_odds,
-    splice_phase,
-    translating_factor,
 )
+from tagjax.baselines.tagview.interpolation import interpolate
+from tagjax.baselines.tagview.line_fit import fit_line, fit_pairs, translating_factor
+from tagjax.baselines.tagview.matching import MatchSettings, Traces, identify
+from tagjax.baselines.tagview.quadratic_programme import select_edges
+from tagjax.baselines.tagview.rssi_agreement import agreement, shared_times
+from tagjax.baselines.tagview.sequences import ReadSettings, TagMeasurements, TagSequences, tag_measurements
+from tagjax.baselines.tagview.splicing import pieces, splice_phase
 from tagjax.recording import TagReads
 
 WAVELENGTH_M = 0.3276
@@ -58,7 +49,7 @@ def _all(size: int) -> jax.Array:
 
 
 @pytest.mark.parametrize("period", [2 * np.pi, np.pi])
-def test_splicing_gives_the_phase_back_up_to_whole_periods(period):
+def test_splicing_recovers_the_phase_up_to_whole_periods(period):
     time = np.linspace(0, 4, 300)
     true = 9.0 * np.sin(time) + 20.0 * time / 4
     flips = np.random.default_rng(0).integers(0, 2, 300) * np.pi if period == np.pi else 0.0
@@ -67,7 +58,7 @@ def test_splicing_gives_the_phase_back_up_to_whole_periods(period):
     np.testing.assert_allclose(spliced - spliced[0], true - true[0], atol=1e-4)
 
 
-def test_splicing_skips_reads_that_do_not_count():
+def test_splicing_skips_invalid_reads():
     phase = jnp.asarray([0.1, 3.0, 0.4, 0.7, 2.9, 2.9], jnp.float32)
     valid = jnp.asarray([True, False, True, True, False, False])
     np.testing.assert_allclose(_splice(phase, valid, 2 * np.pi), [0.1, 0.1, 0.4, 0.7, 0.7, 0.7], atol=1e-6)
@@ -107,7 +98,7 @@ def test_interpolation_is_scipys_pchip(count):
     np.testing.assert_allclose(ours, PchipInterpolator(time, value)(at), atol=2e-4)
 
 
-def test_interpolation_at_the_edges_of_what_is_known():
+def test_interpolation_is_constant_beyond_the_ends():
     at = jnp.asarray([-1.0, 0.5, 9.0], jnp.float32)
     time, value = jnp.asarray([0.0, 1.0, 2.0], jnp.float32), jnp.asarray([3.0, 5.0, 4.0], jnp.float32)
     one = _interpolate(time, value, jnp.asarray([True, False, False]), at)
@@ -151,7 +142,7 @@ def test_a_moving_tag_lies_on_the_line_of_its_height():
     assert float(fit.r_squared) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_the_line_is_numpys():
+def test_the_line_is_that_of_numpy():
     gamma, phase = _line_data()
     valid = np.arange(40) % 5 > 0
     fit = _fit(*(jnp.asarray(x, jnp.float32) for x in (gamma, phase)), jnp.asarray(valid), jnp.zeros(40, jnp.int32))
@@ -163,7 +154,7 @@ def test_the_line_is_numpys():
     assert float(fit.count) == valid.sum()
 
 
-def test_pieces_have_intercepts_of_their_own():
+def test_each_piece_has_its_own_intercept():
     gamma, phase = _line_data()
     piece = np.arange(40) // 15
     shifted = phase + np.array([0.0, 40.0, -11.0])[piece]
@@ -211,11 +202,11 @@ def test_lines_have_gradients_and_run_compiled_and_batched(gradients_agree):
     )
     rng = np.random.default_rng(1)
     traces, tags = (jnp.asarray(rng.normal(size=(n, 20)), jnp.float32) for n in (3, 2))
-    seen, heard = (jnp.asarray(rng.uniform(size=(n, 20)) < 0.8) for n in (3, 2))
+    seen, measured = (jnp.asarray(rng.uniform(size=(n, 20)) < 0.8) for n in (3, 2))
     parts = jnp.zeros((2, 20), jnp.int32)
-    table = jax.jit(fit_pairs)(traces, seen, tags, heard, parts)
+    table = jax.jit(fit_pairs)(traces, seen, tags, measured, parts)
     for k, i in itertools.product(range(3), range(2)):
-        one = _fit(traces[k], tags[i], jnp.asarray(np.asarray(seen[k]) & np.asarray(heard[i])), parts[i])
+        one = _fit(traces[k], tags[i], jnp.asarray(np.asarray(seen[k]) & np.asarray(measured[i])), parts[i])
         assert float(table.slope[k, i]) == pytest.approx(float(one.slope), rel=1e-4)
         assert float(table.r_squared[k, i]) == pytest.approx(float(one.r_squared), abs=1e-5)
 
@@ -234,7 +225,7 @@ def test_the_nearer_tag_is_the_stronger_one():
     table = _agreement([weak, strong], [far, near])
     assert table[0, 1, 0, 1] == 1.0  # far trace with weak tag, near with strong
     assert table[0, 1, 1, 0] == 0.0
-    assert table[0, 1, 0, 0] == 0.5  # one tag says nothing against itself
+    assert table[0, 1, 0, 0] == 0.5  # a tag compared with itself is no evidence
     assert table[0, 0, 0, 1] == 0.5
 
 
@@ -249,16 +240,16 @@ def test_without_ties_agreement_is_the_papers_exclusive_or():
     np.testing.assert_array_equal(table, table.transpose(1, 0, 3, 2))
 
 
-def test_agreement_counts_what_both_share_and_softens():
+def test_agreement_uses_common_times_and_has_a_soft_form():
     rssi, distance = jnp.asarray([[-60.0, -60.0], [-66.0, -50.0]]), jnp.asarray([[1.0, 1.0], [2.0, 2.0]])
-    heard = jnp.asarray([[True, True], [True, False]])
+    measured = jnp.asarray([[True, True], [True, False]])
     seen = jnp.ones((2, 2), bool)
-    assert float(_agree(rssi, heard, distance, seen)[0, 1, 0, 1]) == 1.0
+    assert float(_agree(rssi, measured, distance, seen)[0, 1, 0, 1]) == 1.0
     assert float(_agree(rssi, jnp.zeros((2, 2), bool), distance, seen)[0, 1, 0, 1]) == 0.5
-    soft = _agree(rssi, heard, distance, seen, rssi_width_db=1e-3, distance_width_px=1e-3)
-    np.testing.assert_allclose(soft, _agree(rssi, heard, distance, seen), atol=1e-6)
+    soft = _agree(rssi, measured, distance, seen, rssi_width_db=1e-3, distance_width_px=1e-3)
+    np.testing.assert_allclose(soft, _agree(rssi, measured, distance, seen), atol=1e-6)
     gradient = jax.grad(
-        lambda r: _agree(r, heard, distance, seen, rssi_width_db=3.0, distance_width_px=1.0)[0, 1, 0, 1]
+        lambda r: _agree(r, measured, distance, seen, rssi_width_db=3.0, distance_width_px=1.0)[0, 1, 0, 1]
     )
     assert float(gradient(rssi)[0, 0]) > 0 > float(gradient(rssi)[1, 0])
 
@@ -266,7 +257,7 @@ def test_agreement_counts_what_both_share_and_softens():
 # Graph
 
 
-def test_matching_is_one_to_one_and_leaves_worthless_pairs():
+def test_matching_is_one_to_one_and_leaves_pairs_of_weight_0():
     weight = np.array([[0.9, 0.8], [0.85, 0.1], [0.0, 0.0]])
     np.testing.assert_array_equal(match_graph(weight), [1, 0, -1])
     np.testing.assert_array_equal(match_graph(np.zeros((2, 3))), [-1, -1])
@@ -274,22 +265,22 @@ def test_matching_is_one_to_one_and_leaves_worthless_pairs():
 
 def test_pruning_keeps_slopes_near_the_shared_one():
     slope = np.array([[100.0, -90.0], [104.0, 96.0], [160.0, 99.0]])
-    shared = shared_coefficient(slope, np.array([0, 1, -1]), spread="std", least_share=0.0)
+    shared = shared_coefficient(slope, np.array([0, 1, -1]), estimator="std", min_relative_spread=0.0)
     assert shared is not None
     assert (shared.mean, shared.spread) == (98.0, 2.0)
     np.testing.assert_array_equal(keep_edges(slope, shared, 3.0), [[True, False], [True, True], [False, True]])
-    wide = shared_coefficient(slope, np.array([0, 1, -1]), spread="std", least_share=0.5)
+    wide = shared_coefficient(slope, np.array([0, 1, -1]), estimator="std", min_relative_spread=0.5)
     assert wide is not None
     assert wide.spread == 49.0
-    assert shared_coefficient(slope, np.full(3, -1), spread="std", least_share=0.1) is None
+    assert shared_coefficient(slope, np.full(3, -1), estimator="std", min_relative_spread=0.1) is None
     assert not keep_edges(slope, None, 3.0).any()
 
 
 def test_a_wrong_match_does_not_move_the_median():
     slope = np.diag([100.0, 101.0, 99.0, 100.0, -300.0])
     tag_of = np.arange(5)
-    robust = shared_coefficient(slope, tag_of, spread="mad", least_share=0.05)
-    plain = shared_coefficient(slope, tag_of, spread="std", least_share=0.05)
+    robust = shared_coefficient(slope, tag_of, estimator="mad", min_relative_spread=0.05)
+    plain = shared_coefficient(slope, tag_of, estimator="std", min_relative_spread=0.05)
     assert robust is not None
     assert plain is not None
     assert robust.mean == 100.0
@@ -341,7 +332,9 @@ def test_the_papers_size_is_solved_with_proof():
     trace, tag = (x.ravel() for x in np.meshgrid(np.arange(10), np.arange(6), indexing="ij"))
     span = np.array([[0.0, 8.0]] * 4 + [[0.0, 3.0], [4.0, 8.0]] * 3)
     upper = np.triu(rng.uniform(size=(60, 60)), 1)
-    found = select_edges(rng.uniform(size=60), 0.5 * (upper + upper.T), cliques(trace, tag, span, tolerance_s=0.0))
+    found = select_edges(
+        rng.uniform(size=60), 0.5 * (upper + upper.T), cliques(trace, tag, span, tolerance_s=0.0), time_limit_s=60.0
+    )
     assert found.chosen.sum() >= 6
     assert found.gap < 1e-4
 
@@ -373,28 +366,28 @@ def test_edges_have_no_agreement_with_themselves():
     np.testing.assert_array_equal(np.diag(quadratic), 0.0)
 
 
-def test_agreement_counts_from_even_odds_where_it_is_weighed_by_time():
+def test_agreement_by_likelihood_is_relative_to_one_half():
     table = np.random.default_rng(0).uniform(size=(2, 2, 2, 2))
     trace, tag = np.array([0, 1, 1]), np.array([0, 0, 1])
-    together = np.random.default_rng(1).uniform(1, 9, size=(2, 2, 2, 2))
-    quadratic = edge_agreement(table, trace, tag, together)
-    assert quadratic[0, 2] == pytest.approx(together[0, 1, 0, 1] * (table[0, 1, 0, 1] - 0.5))
+    num_shared = np.random.default_rng(1).uniform(1, 9, size=(2, 2, 2, 2))
+    quadratic = edge_agreement(table, trace, tag, num_shared)
+    assert quadratic[0, 2] == pytest.approx(num_shared[0, 1, 0, 1] * (table[0, 1, 0, 1] - 0.5))
     np.testing.assert_array_equal(np.diag(quadratic), 0.0)
-    assert not np.any(edge_agreement(np.full((2, 2, 2, 2), 0.5), trace, tag, together))
+    assert not np.any(edge_agreement(np.full((2, 2, 2, 2), 0.5), trace, tag, num_shared))
 
 
-def test_times_count_at_which_both_traces_are_seen_and_both_strengths_known():
-    seen, heard = np.random.default_rng(0).random((3, 40)) < 0.7, np.random.default_rng(1).random((2, 40)) < 0.5
-    found = np.asarray(shared_times(jnp.asarray(heard), jnp.asarray(seen)))
+def test_shared_times_count_frames_with_both_traces_and_both_rssi():
+    seen, measured = np.random.default_rng(0).random((3, 40)) < 0.7, np.random.default_rng(1).random((2, 40)) < 0.5
+    found = np.asarray(shared_times(jnp.asarray(measured), jnp.asarray(seen)))
     for one, other, i, j in itertools.product(range(3), range(3), range(2), range(2)):
-        assert found[one, other, i, j] == np.sum(seen[one] & seen[other] & heard[i] & heard[j])
+        assert found[one, other, i, j] == np.sum(seen[one] & seen[other] & measured[i] & measured[j])
 
 
-def test_of_likelihood_a_short_trace_has_little_say_in_the_shared_slope():
+def test_a_short_trace_has_little_weight_in_the_shared_slope():
     slope, weight = np.array([[2.0], [6.0]]), np.array([[30.0], [1.0]])
     tag_of = np.array([0, 0])
-    plain = shared_coefficient(slope, tag_of, spread="std", least_share=0.0)
-    weighed = shared_coefficient(slope, tag_of, spread="std", least_share=0.0, weight=weight)
+    plain = shared_coefficient(slope, tag_of, estimator="std", min_relative_spread=0.0)
+    weighed = shared_coefficient(slope, tag_of, estimator="std", min_relative_spread=0.0, weight=weight)
     assert plain is not None
     assert weighed is not None
     assert (plain.mean, plain.spread) == (4.0, 2.0)
@@ -402,7 +395,7 @@ def test_of_likelihood_a_short_trace_has_little_say_in_the_shared_slope():
     assert weighed.spread == pytest.approx(np.sqrt((30 * (2 - 66 / 31) ** 2 + (6 - 66 / 31) ** 2) / 31))
 
 
-def test_a_line_weighs_its_likelihood_ratio():
+def test_the_weight_of_a_line_is_its_likelihood_ratio():
     rng = np.random.default_rng(0)
     x, noise = rng.normal(size=400), rng.normal(size=400)
     y = 2.0 * x + noise
@@ -417,14 +410,14 @@ def test_a_line_weighs_its_likelihood_ratio():
     assert np.isfinite(likelihood_weight(np.ones((1, 1)), np.full((1, 1), 9.0))).all()
 
 
-def test_a_slope_costs_what_a_log_normal_says_up_to_an_outliers_share():
+def test_the_slope_penalty_is_log_normal_with_a_limit():
     shared = Coefficient(2.0, 0.1)
     slope = 2.0 * np.exp([[0.0, 0.25, -0.5, 5.0, -5.0]])
     expected = norm.logpdf([0.0, 0.25, -0.5], 0.0, 0.25) - norm.logpdf(0.0, 0.0, 0.25)
     found = slope_log_odds(np.concatenate([slope, [[-2.0, 0.0, 0.0, 0.0, 0.0]]]), shared, 0.25)
     np.testing.assert_allclose(found[0, :3], expected, atol=1e-12)
-    np.testing.assert_array_equal(found[0, 3:], -SLOPE_OUTLIER_NATS)
-    np.testing.assert_array_equal(found[1], -SLOPE_OUTLIER_NATS)
+    np.testing.assert_array_equal(found[0, 3:], -MAX_SLOPE_PENALTY_NATS)
+    np.testing.assert_array_equal(found[1], -MAX_SLOPE_PENALTY_NATS)
 
 
 # Reads
@@ -452,38 +445,40 @@ def _moving(count=400, seconds=8.0):
     return time, np.hypot(2.4, 0.6 + 0.5 * np.sin(1.3 * time))
 
 
-def test_hops_and_flips_are_taken_off():
+def test_hops_and_flips_are_corrected():
     rng = np.random.default_rng(0)
     time, range_m = _moving()
     carrier = 902.75e6 + 0.5e6 * rng.integers(0, 50, 41)[(time / 0.2).astype(int)]
     flips = rng.integers(0, 10, len(time)) == 0
     reads = _reads(["A"] * len(time), time, range_m, carrier, slope=0.35e-6, flips=flips)
     frames = np.arange(0.1, 7.9, 1 / 15)
-    said = hear(["A", "never"], reads, time, frames, ReadSettings())
-    true = 4 * np.pi / said.wavelength_m * np.hypot(2.4, 0.6 + 0.5 * np.sin(1.3 * frames))
-    found = np.asarray(said.sequences.phase_rad[0])
+    sequences = tag_measurements(["A", "never"], reads, time, frames, ReadSettings())
+    true = 4 * np.pi / sequences.wavelength_m * np.hypot(2.4, 0.6 + 0.5 * np.sin(1.3 * frames))
+    found = np.asarray(sequences.sequences.phase_rad[0])
     error = (found - true) - np.mean(found - true)
     assert np.sqrt(np.mean(error**2)) < 0.25
-    assert np.asarray(said.sequences.heard[0]).all()
-    assert not np.asarray(said.sequences.heard[1]).any()
-    literal = hear(["A"], reads, time, frames, ReadSettings(hops="ignore", flips=False, break_at_gaps=False))
+    assert np.asarray(sequences.sequences.phase_known[0]).all()
+    assert not np.asarray(sequences.sequences.phase_known[1]).any()
+    literal = tag_measurements(
+        ["A"], reads, time, frames, ReadSettings(hops="ignore", pi_flips=False, break_at_gaps=False)
+    )
     wrong = np.asarray(literal.sequences.phase_rad[0]) - true
     assert np.std(wrong) > 1.0
 
 
-def test_gaps_are_not_heard_and_part_the_phase():
+def test_gaps_have_no_phase_and_begin_a_new_piece():
     time, range_m = _moving()
     keep = (time < 3) | (time > 4)
     reads = _reads(["A"] * int(keep.sum()), time[keep], range_m[keep], 915e6)
     frames = np.arange(0.1, 7.9, 0.1)
-    said = hear(["A"], reads, time[keep], frames, ReadSettings()).sequences
-    heard, piece = np.asarray(said.heard[0]), np.asarray(said.piece[0])
+    sequences = tag_measurements(["A"], reads, time[keep], frames, ReadSettings()).sequences
+    measured, piece = np.asarray(sequences.phase_known[0]), np.asarray(sequences.piece[0])
     inside = (frames > 3.05) & (frames < 3.95)
-    assert not heard[inside].any()
-    assert heard[(frames < 2.9) | (frames > 4.1)].all()
+    assert not measured[inside].any()
+    assert measured[(frames < 2.9) | (frames > 4.1)].all()
     assert set(piece[frames < 2.9]) == {0}
     assert set(piece[frames > 4.1]) == {1}
-    assert not np.asarray(said.strong[0])[(frames > 3.2) & (frames < 3.8)].any()
+    assert not np.asarray(sequences.rssi_known[0])[(frames > 3.2) & (frames < 3.8)].any()
 
 
 def test_settings_are_checked():
@@ -491,29 +486,29 @@ def test_settings_are_checked():
         ReadSettings(antenna=0)
     with pytest.raises(ValueError, match="max_gap_s"):
         ReadSettings(max_gap_s=0.0)
-    with pytest.raises(ValueError, match="least_samples"):
-        MatchSettings(least_samples=2)
-    with pytest.raises(ValueError, match="threshold"):
-        MatchSettings(threshold=0.0)
-    with pytest.raises(ValueError, match="independent_s is 0"):
-        MatchSettings(independent_s=0.0)
-    with pytest.raises(ValueError, match=r"slope_spread is 0\.2 with weigh r_squared"):
-        MatchSettings(slope_spread=0.2)
-    with pytest.raises(ValueError, match=r"named_nats is 2\.0 without slope_spread"):
-        MatchSettings(weigh="likelihood", named_nats=2.0)
+    with pytest.raises(ValueError, match="min_samples"):
+        MatchSettings(min_samples=2)
+    with pytest.raises(ValueError, match="max_z_score"):
+        MatchSettings(max_z_score=0.0)
+    with pytest.raises(ValueError, match="correlation_time_s is 0"):
+        MatchSettings(correlation_time_s=0.0)
+    with pytest.raises(ValueError, match=r"log_slope_std is 0\.2 with edge_weight r_squared"):
+        MatchSettings(log_slope_std=0.2)
+    with pytest.raises(ValueError, match=r"prior_log_odds is 2\.0 without log_slope_std"):
+        MatchSettings(edge_weight="likelihood", prior_log_odds=2.0)
     with pytest.raises(ValueError, match="without the programme"):
-        MatchSettings(weigh="likelihood", programme=False)
-    with pytest.raises(ValueError, match="slope_spread is 0"):
-        MatchSettings(weigh="likelihood", slope_spread=0.0)
+        MatchSettings(edge_weight="likelihood", programme=False)
+    with pytest.raises(ValueError, match="log_slope_std is 0"):
+        MatchSettings(edge_weight="likelihood", log_slope_std=0.0)
 
 
-# All together
+# All num_shared
 
 FOCAL_PX, HEIGHT_M = 183.0, 2.4
 
 
 def _world(num, *, antenna_m=(0.0, 0.0), seed=0, frames=96, noise=0.05):
-    """Traces of things on loops, and what their tags say."""
+    """Traces of objects on loops, and the measurements of their tags."""
     rng = np.random.default_rng(seed)
     time = np.arange(frames) / 15
     centre = rng.uniform(-0.6, 0.6, (num, 2))
@@ -523,7 +518,7 @@ def _world(num, *, antenna_m=(0.0, 0.0), seed=0, frames=96, noise=0.05):
     phase = (
         4 * np.pi / WAVELENGTH_M * range_m + rng.uniform(0, 6, num)[:, None] + rng.normal(size=range_m.shape) * noise
     )
-    said = TagSequences(
+    sequences = TagSequences(
         jnp.asarray(phase, jnp.float32),
         jnp.ones(phase.shape, bool),
         jnp.zeros(phase.shape, jnp.int32),
@@ -531,7 +526,7 @@ def _world(num, *, antenna_m=(0.0, 0.0), seed=0, frames=96, noise=0.05):
         jnp.ones(phase.shape, bool),
     )
     traces = Traces(tuple(range(1, num + 1)), time, place / HEIGHT_M, np.ones((num, frames), bool))
-    return traces, Heard(said, WAVELENGTH_M)
+    return traces, TagMeasurements(sequences, WAVELENGTH_M)
 
 
 NADIR = np.zeros(3)
@@ -539,41 +534,41 @@ NADIR = np.zeros(3)
 
 @pytest.mark.parametrize("num", [1, 2, 4, 6])
 def test_every_trace_gets_its_tag(num):
-    traces, heard = _world(num)
-    found = identify(traces, heard, FOCAL_PX, NADIR, MatchSettings())
+    traces, measured = _world(num)
+    found = identify(traces, measured, FOCAL_PX, NADIR, MatchSettings())
     np.testing.assert_array_equal(found.tag_of, np.arange(num))
     assert found.height_m == pytest.approx(HEIGHT_M, rel=0.02)
     assert found.selection is not None
     assert found.selection.gap < 1e-6
 
 
-def test_the_antennas_foot_straightens_the_line():
-    traces, heard = _world(3, antenna_m=(-0.12, 0.0))
-    plain = identify(traces, heard, FOCAL_PX, np.array([-0.12, 0.0, 0.0]), MatchSettings(mu=0.0))
-    moved = identify(traces, heard, FOCAL_PX, np.array([-0.12, 0.0, 0.0]), MatchSettings(mu=0.0, origin="antenna"))
+def test_the_point_below_the_antenna_straightens_the_line():
+    traces, measured = _world(3, antenna_m=(-0.12, 0.0))
+    plain = identify(traces, measured, FOCAL_PX, np.array([-0.12, 0.0, 0.0]), MatchSettings(mu=0.0))
+    moved = identify(traces, measured, FOCAL_PX, np.array([-0.12, 0.0, 0.0]), MatchSettings(mu=0.0, origin="antenna"))
     own = np.arange(3)
     assert np.all(moved.r_squared[own, own] > 0.998)
     assert np.ptp(moved.slope[own, own]) < 0.3 * np.ptp(plain.slope[own, own])
 
 
-def _split(traces, heard):
-    """The first trace parted in two, with a gap between."""
+def _split(traces, measured):
+    """The first trace split in two, with a gap between."""
     seen = np.repeat(traces.seen, [2, *[1] * (len(traces.number) - 1)], axis=0)
     seen[0, 44:], seen[1, :52] = False, False
     direction = np.repeat(traces.direction, [2, *[1] * (len(traces.number) - 1)], axis=0)
-    return Traces(tuple(range(len(seen))), traces.time_s, direction, seen), heard
+    return Traces(tuple(range(len(seen))), traces.time_s, direction, seen), measured
 
 
 def test_a_tag_may_have_several_traces_that_do_not_overlap():
-    traces, heard = _split(*_world(3))
-    found = identify(traces, heard, FOCAL_PX, NADIR, MatchSettings(least_spread=0.1))
+    traces, measured = _split(*_world(3))
+    found = identify(traces, measured, FOCAL_PX, NADIR, MatchSettings(min_relative_spread=0.1))
     np.testing.assert_array_equal(found.tag_of, [0, 0, 1, 2])
-    alone = identify(traces, heard, FOCAL_PX, NADIR, MatchSettings(programme=False))
+    alone = identify(traces, measured, FOCAL_PX, NADIR, MatchSettings(programme=False))
     assert sorted(alone.tag_of) == [-1, 0, 1, 2]
 
 
-def test_strengths_part_traces_of_like_phase():
-    """Half a wavelength apart in distance: gamma differs by a constant, and the phases are the same."""
+def test_rssi_separates_traces_of_equal_phase():
+    """Half a wavelength apart in range: gamma differs by a constant, and the phases are equal."""
     time = np.arange(90) / 15
     near = 2.5 + 0.1 * np.sin(time)
     ranges = np.stack([near, near + WAVELENGTH_M / 2])
@@ -584,68 +579,68 @@ def test_strengths_part_traces_of_like_phase():
     for order in ([0, 1], [1, 0]):
         rssi = (-60 - 40 * np.log10(ranges / 2.4))[order]
         ones = jnp.ones((2, 90), bool)
-        said = TagSequences(
+        sequences = TagSequences(
             jnp.asarray(phase, jnp.float32), ones, jnp.zeros((2, 90), jnp.int32), jnp.asarray(rssi, jnp.float32), ones
         )
-        found = identify(traces, Heard(said, WAVELENGTH_M), 183.0, NADIR, MatchSettings())
+        found = identify(traces, TagMeasurements(sequences, WAVELENGTH_M), 183.0, NADIR, MatchSettings())
         np.testing.assert_array_equal(found.tag_of, order)
         assert np.ptp(found.r_squared) < 1e-3
 
 
-def test_nothing_to_name_and_nothing_to_name_it_with():
-    traces, heard = _world(2)
+def test_no_traces_no_tags_and_no_reads_are_defined():
+    traces, measured = _world(2)
     none = Traces((), traces.time_s, np.zeros((0, 96, 2)), np.zeros((0, 96), bool))
-    assert identify(none, heard, FOCAL_PX, NADIR, MatchSettings()).tag_of.shape == (0,)
-    silent = Heard(jax.tree.map(lambda x: x[:0], heard.sequences), WAVELENGTH_M)
-    np.testing.assert_array_equal(identify(traces, silent, FOCAL_PX, NADIR, MatchSettings()).tag_of, [-1, -1])
-    deaf = Heard(
+    assert identify(none, measured, FOCAL_PX, NADIR, MatchSettings()).tag_of.shape == (0,)
+    no_tags = TagMeasurements(jax.tree.map(lambda x: x[:0], measured.sequences), WAVELENGTH_M)
+    np.testing.assert_array_equal(identify(traces, no_tags, FOCAL_PX, NADIR, MatchSettings()).tag_of, [-1, -1])
+    unread = TagMeasurements(
         TagSequences(
-            heard.sequences.phase_rad,
+            measured.sequences.phase_rad,
             jnp.zeros((2, 96), bool),
-            heard.sequences.piece,
-            heard.sequences.rssi_dbm,
+            measured.sequences.piece,
+            measured.sequences.rssi_dbm,
             jnp.zeros((2, 96), bool),
         ),
         WAVELENGTH_M,
     )
-    unheard = identify(traces, deaf, FOCAL_PX, NADIR, MatchSettings())
-    np.testing.assert_array_equal(unheard.tag_of, [-1, -1])
-    assert np.isnan(unheard.height_m)
+    unmatched = identify(traces, unread, FOCAL_PX, NADIR, MatchSettings())
+    np.testing.assert_array_equal(unmatched.tag_of, [-1, -1])
+    assert np.isnan(unmatched.height_m)
 
 
 def test_more_tags_than_traces_and_traces_without_a_tag():
-    traces, heard = _world(4)
+    traces, measured = _world(4)
     few = Traces((1, 2), traces.time_s, traces.direction[[2, 0]], traces.seen[:2])
-    np.testing.assert_array_equal(identify(few, heard, FOCAL_PX, NADIR, MatchSettings()).tag_of, [2, 0])
-    two = Heard(jax.tree.map(lambda x: x[jnp.array([1, 3])], heard.sequences), WAVELENGTH_M)
-    found = identify(traces, two, FOCAL_PX, NADIR, MatchSettings(least_r_squared=0.8))
+    np.testing.assert_array_equal(identify(few, measured, FOCAL_PX, NADIR, MatchSettings()).tag_of, [2, 0])
+    two = TagMeasurements(jax.tree.map(lambda x: x[jnp.array([1, 3])], measured.sequences), WAVELENGTH_M)
+    found = identify(traces, two, FOCAL_PX, NADIR, MatchSettings(min_r_squared=0.8))
     np.testing.assert_array_equal(found.tag_of, [-1, 0, -1, 1])
 
 
-def test_of_likelihood_every_trace_may_be_taken_for_a_tagged_things():
-    """Of a short trace the fit alone says little: it is named by its slope, and at all where all traces are some tag's."""
-    traces, heard = _world(3, noise=0.6)
+def test_the_prior_identifies_short_traces():
+    """The fit of a short trace is weak evidence: its slope and the prior identify it."""
+    traces, measured = _world(3, noise=0.6)
     seen = traces.seen.copy()
     seen[0, 6:] = False
     short = Traces(traces.number, traces.time_s, traces.direction, seen)
-    settings = {"weigh": "likelihood", "slope_spread": 0.25, "least_samples": 4, "mu": 0.0}
-    found = identify(short, heard, FOCAL_PX, NADIR, MatchSettings(**settings, named_nats=9.0))
+    settings = {"edge_weight": "likelihood", "log_slope_std": 0.25, "min_samples": 4, "mu": 0.0}
+    found = identify(short, measured, FOCAL_PX, NADIR, MatchSettings(**settings, prior_log_odds=9.0))
     np.testing.assert_array_equal(found.tag_of, [0, 1, 2])
-    assert identify(short, heard, FOCAL_PX, NADIR, MatchSettings(**settings)).tag_of[0] == -1
-    # A thing without a tag, in sight beside those that have one, stays unnamed: a tag is in one place at a time.
-    two = Heard(jax.tree.map(lambda x: x[1:], heard.sequences), WAVELENGTH_M)
-    found = identify(traces, two, FOCAL_PX, NADIR, MatchSettings(**settings, named_nats=9.0))
+    assert identify(short, measured, FOCAL_PX, NADIR, MatchSettings(**settings)).tag_of[0] == -1
+    # An object without a tag, seen at the same time as those with one, stays unidentified: a tag is at one position.
+    two = TagMeasurements(jax.tree.map(lambda x: x[1:], measured.sequences), WAVELENGTH_M)
+    found = identify(traces, two, FOCAL_PX, NADIR, MatchSettings(**settings, prior_log_odds=9.0))
     np.testing.assert_array_equal(found.tag_of, [-1, 0, 1])
 
 
 def test_one_sample_and_equal_traces():
-    traces, heard = _world(2)
+    traces, measured = _world(2)
     brief = traces.seen.copy()
     brief[1, 1:] = False
-    found = identify(Traces((1, 2), traces.time_s, traces.direction, brief), heard, FOCAL_PX, NADIR, MatchSettings())
+    found = identify(Traces((1, 2), traces.time_s, traces.direction, brief), measured, FOCAL_PX, NADIR, MatchSettings())
     np.testing.assert_array_equal(found.tag_of, [0, -1])
-    assert found.weight[1].max() == 0.0
+    assert found.fit[1].max() == 0.0
     same = Traces((1, 2), traces.time_s, traces.direction[[0, 0]], traces.seen)
-    twice = identify(same, heard, FOCAL_PX, NADIR, MatchSettings())
+    twice = identify(same, measured, FOCAL_PX, NADIR, MatchSettings())
     np.testing.assert_allclose(twice.r_squared[0], twice.r_squared[1])
     assert np.sum(twice.tag_of == 0) == 1

@@ -15,28 +15,25 @@ import tagvision_scenes as scenes
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax.baselines.tagvision import (
-    BlobSettings,
-    Board,
-    CalibrateSettings,
-    MatchSettings,
+from tagjax.baselines.reads import hop_slope_rad_hz, range_phase_rad
+from tagjax.baselines.tagvision import TagVisionSettings
+from tagjax.baselines.tagvision.calibration import Board
+from tagjax.baselines.tagvision.detection import BlobSettings
+from tagjax.baselines.tagvision.experiment import TagVisionExperiment, run_tagvision
+from tagjax.baselines.tagvision.experiment.lines import LineSettings, line_scores
+from tagjax.baselines.tagvision.matching import MatchSettings, match_tags
+from tagjax.baselines.tagvision.pairing import motion_direction, nearest_reads, pair_interpolated, pair_nearest
+from tagjax.baselines.tagvision.phase_score import (
     Snapshots,
-    TagVisionSettings,
-    TrackSettings,
     draw_snapshots,
-    heading,
-    hop_slope,
     match_scores,
-    match_tags,
-    nearest_reads,
-    pair_interpolated,
-    pair_nearest,
     phase_score,
     residuals_rad,
     theory_rad,
 )
+from tagjax.baselines.tagvision.picture_folder import CalibrateSettings
+from tagjax.baselines.tagvision.tracks import TrackSettings
 from tagjax.core.settings import ConfigError, from_mapping
-from tagjax.evaluation.tagvision import LineSettings, TagVisionExperiment, line_scores, run_tagvision
 
 C = 299_792_458.0
 SIGMA = 0.1 * np.sqrt(2.0)
@@ -65,7 +62,7 @@ def test_score_is_the_papers(reference: str) -> None:
         assert float(found) == pytest.approx(_numpy_score(residual, first=reference == "first"), abs=2e-6)
 
 
-def test_score_takes_out_an_unknown_offset_and_whole_turns() -> None:
+def test_score_is_invariant_to_an_offset_and_whole_turns() -> None:
     rng = np.random.default_rng(1)
     residual = jnp.asarray(rng.normal(0, 0.2, 20), jnp.float32)
     counted = jnp.ones(20, bool)
@@ -76,18 +73,18 @@ def test_score_takes_out_an_unknown_offset_and_whole_turns() -> None:
     assert float(absolute) < 0.1 * float(base)
 
 
-def test_doubled_angles_leave_pi_flips_alone() -> None:
+def test_doubled_angles_are_invariant_to_pi_flips() -> None:
     rng = np.random.default_rng(2)
     residual = rng.normal(0, 0.05, 40)
     flipped = residual + np.pi * rng.integers(0, 2, 40)
     counted = jnp.ones(40, bool)
     plain, turned = (jnp.asarray(r, jnp.float32) for r in (residual, flipped))
-    twice = [float(phase_score(r, counted, sigma_rad=SIGMA, multiple=2)) for r in (plain, turned)]
+    twice = [float(phase_score(r, counted, sigma_rad=SIGMA, angle_multiple=2)) for r in (plain, turned)]
     assert twice[0] == pytest.approx(twice[1], abs=1e-4)
     assert float(phase_score(turned, counted, sigma_rad=SIGMA)) < 0.75 * twice[0]
 
 
-def test_score_of_nothing_is_nothing() -> None:
+def test_score_without_snapshots_is_zero() -> None:
     residual = jnp.asarray([0.3, 1.0, -2.0], jnp.float32)
     none, one = jnp.zeros(3, bool), jnp.asarray([False, True, False])
     for reference in ("first", "absolute"):
@@ -100,7 +97,7 @@ def test_score_of_nothing_is_nothing() -> None:
         assert np.all(np.isfinite(gradient))
 
 
-def test_what_does_not_count_may_be_anything() -> None:
+def test_uncounted_snapshots_may_have_any_value() -> None:
     residual, counted = jnp.asarray([0.0, 0.05, jnp.nan], jnp.float32), jnp.asarray([True, True, False])
     for reference in ("first", "absolute"):
         score = lambda r, c, by=reference: phase_score(r, c, sigma_rad=SIGMA, reference=by)  # noqa: E731
@@ -110,9 +107,9 @@ def test_what_does_not_count_may_be_anything() -> None:
         assert gradient[2] == 0.0
     known = Snapshots(residual, jnp.full(3, 9e8), jnp.ones((2, 3)), jnp.broadcast_to(counted, (2, 3)))
     odd = Snapshots(residual, jnp.asarray([9e8, 9e8, jnp.nan]), jnp.ones((2, 3)).at[:, 2].set(jnp.nan), known.valid)
-    said = [match_scores(s, key=jax.random.key(0), num_rounds=2) for s in (known, odd)]
-    np.testing.assert_allclose(said[0], said[1], atol=1e-6)
-    assert said[0][0] > 0.5
+    scores = [match_scores(s, key=jax.random.key(0), num_rounds=2) for s in (known, odd)]
+    np.testing.assert_allclose(scores[0], scores[1], atol=1e-6)
+    assert scores[0][0] > 0.5
     slope = jax.grad(lambda s: jnp.sum(match_scores(odd, key=jax.random.key(0), num_rounds=2, hop_slope_rad_hz=s)))
     assert np.isfinite(slope(jnp.zeros(())))
 
@@ -124,23 +121,23 @@ def test_no_snapshots_and_no_candidates_are_defined() -> None:
     for candidates, number in ((3, 0), (0, 4), (0, 0)):
         shape = (candidates, number)
         some = Snapshots(jnp.zeros(number), jnp.full(number, 9e8), jnp.ones(shape), jnp.ones(shape, bool))
-        said = match_scores(some, key=jax.random.key(0), num_rounds=2)
-        np.testing.assert_array_equal(said, np.zeros(candidates))
+        scores = match_scores(some, key=jax.random.key(0), num_rounds=2)
+        np.testing.assert_array_equal(scores, np.zeros(candidates))
 
 
 def test_score_refuses_unknown_settings() -> None:
     counted = jnp.ones(3, bool)
-    with pytest.raises(ValueError, match="multiple is 3"):
-        phase_score(jnp.zeros(3), counted, sigma_rad=SIGMA, multiple=3)
+    with pytest.raises(ValueError, match="angle_multiple is 3"):
+        phase_score(jnp.zeros(3), counted, sigma_rad=SIGMA, angle_multiple=3)
 
 
-@pytest.mark.parametrize("multiple", [1, 2])
+@pytest.mark.parametrize("angle_multiple", [1, 2])
 @pytest.mark.parametrize("reference", ["first", "absolute"])
-def test_score_gradients(gradients_agree, reference: str, multiple: int) -> None:
+def test_score_gradients(gradients_agree, reference: str, angle_multiple: int) -> None:
     residual = np.random.default_rng(3).normal(0, 0.4, 9)
     counted = jnp.asarray(np.arange(9) != 4)
     gradients_agree(
-        lambda r, s: phase_score(r, counted, sigma_rad=s, reference=reference, multiple=multiple),
+        lambda r, s: phase_score(r, counted, sigma_rad=s, reference=reference, angle_multiple=angle_multiple),
         (residual, np.array(0.3)),
     )
 
@@ -201,7 +198,7 @@ def test_snapshots_are_drawn_once_each_and_in_order() -> None:
     assert len({tuple(one) for one in drawn}) == 8
 
 
-def test_affine_channel_offsets_drop_out() -> None:
+def test_affine_channel_offsets_cancel() -> None:
     rng = np.random.default_rng(6)
     carrier = rng.choice(902.75e6 + 0.5e6 * np.arange(50), 80)
     distance = np.stack([rng.uniform(1, 2, 80), rng.uniform(1, 2, 80)])
@@ -225,31 +222,31 @@ def test_affine_channel_offsets_drop_out() -> None:
 
 
 def test_planar_101_with_known_phases_is_as_the_paper_says() -> None:
-    told = line_scores(LineSettings(reference="absolute")).summary()
-    assert told["truth_is_maximum"] == 1.0
-    assert told["truth_is_maximum_share_of_rounds"] > 0.95
-    assert told["others_below_0.075"] >= 0.9
-    # What the paper does not say: neighbours, and lines half a wavelength away, are not told apart so well.
-    assert told["neighbours"] > 0.3
-    assert told["others_most"] > 0.6
+    summary = line_scores(LineSettings(reference="absolute")).summary()
+    assert summary["truth_is_maximum"] == 1.0
+    assert summary["truth_is_maximum_fraction_of_rounds"] > 0.95
+    assert summary["others_below_0.075"] >= 0.9
+    # Not in the paper: neighbours, and lines half a wavelength away, are harder to distinguish.
+    assert summary["neighbours"] > 0.3
+    assert summary["others_max"] > 0.6
 
 
-def test_planar_101_with_an_unknown_offset_tells_nothing_until_the_geometry_does() -> None:
+def test_planar_101_with_an_unknown_offset_needs_another_geometry() -> None:
     cases = {
         "stated": LineSettings(),
         "out of line": LineSettings(antenna_m=(1.018, -0.6)),
         "long": LineSettings(half_length_m=1.5),
         "circles": LineSettings(circle_m=1.0),
     }
-    told = {name: line_scores(settings).summary() for name, settings in cases.items()}
-    assert told["stated"]["others_least"] > 0.5
-    assert told["stated"]["others_below_0.075"] == 0.0
-    assert told["stated"]["truth_is_maximum_share_of_rounds"] < 0.1
-    assert told["stated"]["error_of_a_round_mm"] > 50
+    summary = {name: line_scores(settings).summary() for name, settings in cases.items()}
+    assert summary["stated"]["others_min"] > 0.5
+    assert summary["stated"]["others_below_0.075"] == 0.0
+    assert summary["stated"]["truth_is_maximum_fraction_of_rounds"] < 0.1
+    assert summary["stated"]["error_of_a_round_mm"] > 50
     for name, limit_mm in (("out of line", 25), ("long", 10), ("circles", 5)):
-        assert told[name]["truth_is_maximum"] == 1.0, name
-        assert told[name]["error_of_a_round_mm"] < limit_mm, name
-        assert told[name]["others_median"] < 0.45, name
+        assert summary[name]["truth_is_maximum"] == 1.0, name
+        assert summary[name]["error_of_a_round_mm"] < limit_mm, name
+        assert summary[name]["others_median"] < 0.45, name
 
 
 # reads and frames
@@ -266,7 +263,7 @@ def test_the_nearest_read_is_the_nearest() -> None:
         nearest_reads(frames, reads[:0])
 
 
-def test_pairing_leaves_out_what_is_unknown_or_far() -> None:
+def test_pairing_excludes_unknown_positions_and_distant_frames() -> None:
     frames, reads = np.arange(10) / 10, np.array([0.04, 0.45, 0.9])
     place = np.column_stack([np.arange(10.0), np.zeros(10), np.zeros(10)])
     place[3] = np.nan
@@ -289,14 +286,14 @@ def test_heading_is_along_the_path() -> None:
     time_s = np.arange(60) / 30
     angle = 1.5 * time_s
     circle = np.column_stack([np.cos(angle), np.sin(angle), np.full(60, 0.1)])
-    found = heading(time_s, circle)
+    found = motion_direction(time_s, circle)
     inner = slice(8, -8)
     np.testing.assert_allclose(found[inner, 0], -np.sin(angle)[inner], atol=0.01)
     np.testing.assert_allclose(found[inner, 1], np.cos(angle)[inner], atol=0.01)
     assert np.all(found[:, 2] == 0)
-    assert np.all(np.isnan(heading(time_s, np.broadcast_to([1.0, 2.0, 0.0], (60, 3)))))
+    assert np.all(np.isnan(motion_direction(time_s, np.broadcast_to([1.0, 2.0, 0.0], (60, 3)))))
     circle[20:30] = np.nan
-    gap = heading(time_s, circle)
+    gap = motion_direction(time_s, circle)
     assert np.all(np.isnan(gap[20:30]))
     assert np.all(np.isfinite(gap[:20]))
 
@@ -315,28 +312,28 @@ def test_tags_are_matched_to_their_paths(pairing: str) -> None:
     assert set(found["A"].scores) == set(paths)
 
 
-def test_a_tag_ahead_of_its_hosts_middle_is_found_by_its_lead() -> None:
+def test_the_offset_of_a_tag_ahead_of_its_host_is_found() -> None:
     time_s, paths = scenes.curves(3)
-    ahead = heading(time_s, paths[1], 0.05)
+    ahead = motion_direction(time_s, paths[1], 0.05)
     reads, when = scenes.make_reads({"A": paths[1] + 0.1 * ahead}, time_s, scenes.ANTENNA)
-    leads = (0.0, 0.05, 0.1, 0.15)
-    found = match_tags(("A",), time_s, paths, reads, when, scenes.ANTENNA, dataclasses.replace(QUICK, leads_m=leads))[
-        "A"
-    ]
+    offsets = (0.0, 0.05, 0.1, 0.15)
+    found = match_tags(
+        ("A",), time_s, paths, reads, when, scenes.ANTENNA, dataclasses.replace(QUICK, tag_offsets_m=offsets)
+    )["A"]
     middle = match_tags(("A",), time_s, paths, reads, when, scenes.ANTENNA, QUICK)["A"]
     assert found.track == 1
-    assert found.lead_m == pytest.approx(0.1)
+    assert found.tag_offset_m == pytest.approx(0.1)
     assert found.score > 1.5 * middle.scores[1]
 
 
-def test_defined_results_for_odd_input() -> None:
+def test_results_are_defined_for_unusual_input() -> None:
     time_s, paths = scenes.curves(2)
     reads, when = scenes.make_reads({"A": paths[0], "B": paths[0]}, time_s, scenes.ANTENNA)
     none = match_tags(("A",), time_s, {}, reads, when, scenes.ANTENNA, QUICK)["A"]
     assert (none.track, none.score, none.confidence) == (-1, 0.0, 0.0)
     unread = match_tags(("C",), time_s, paths, reads, when, scenes.ANTENNA, QUICK)["C"]
     assert unread.track == -1
-    # More tags than blobs: the same one for both, or none for the one that gains less.
+    # More tags than blobs: one blob for both, or none for the tag that gains less.
     lone = {5: paths[0]}
     both = match_tags(("A", "B"), time_s, lone, reads, when, scenes.ANTENNA, QUICK)
     assert [both[epc].track for epc in "AB"] == [5, 5]
@@ -347,11 +344,11 @@ def test_defined_results_for_odd_input() -> None:
     assert sorted(exclusive[epc].track for epc in "AB") == [-1, 5]
     better = max("AB", key=lambda epc: both[epc].score)
     assert exclusive[better].track == 5
-    # Equal traces: the older one, and no confidence in it.
+    # Equal traces: the older one, with confidence 1/2.
     equal = match_tags(("A",), time_s, {3: paths[0], 4: paths[0]}, reads, when, scenes.ANTENNA, QUICK)["A"]
     assert equal.track == 3
     assert equal.confidence == pytest.approx(0.5, abs=1e-6)
-    # One sample, or none, says nothing.
+    # One sample, or none, is no evidence.
     once = match_tags(
         ("A",), time_s, paths, reads[:1], when[:1], scenes.ANTENNA, dataclasses.replace(QUICK, pairing="interpolate")
     )
@@ -360,26 +357,27 @@ def test_defined_results_for_odd_input() -> None:
     assert match_tags(("A",), time_s, hidden, reads, when, scenes.ANTENNA, QUICK)["A"].track == 1
 
 
-def test_a_short_track_is_no_candidate_if_so_chosen() -> None:
+def test_a_short_track_is_no_candidate_with_a_minimum_fraction() -> None:
     time_s, paths = scenes.curves(2)
     reads, when = scenes.make_reads({"A": paths[0]}, time_s, scenes.ANTENNA)
     brief = np.full_like(paths[1], np.nan)
     brief[:24] = paths[1][:1] + 1e-4 * np.arange(24)[:, None]
-    chosen = dataclasses.replace(QUICK, least_share=0.5)
+    chosen = dataclasses.replace(QUICK, min_snapshot_fraction=0.5)
     found = match_tags(("A",), time_s, {0: paths[0], 1: brief}, reads, when, scenes.ANTENNA, chosen)["A"]
     assert set(found.scores) == {0}
 
 
-def test_hop_slope_is_nan_where_hops_say_nothing() -> None:
+def test_hop_slope_is_nan_without_hops() -> None:
     time_s, paths = scenes.curves(1)
     reads, when = scenes.make_reads({"A": paths[0]}, time_s, scenes.ANTENNA)
-    assert np.isnan(hop_slope(reads, when))
+    slope = hop_slope_rad_hz(range_phase_rad(reads), when, np.asarray(reads.carrier_hz))
+    assert np.isnan(slope)
 
 
 def test_settings_are_checked() -> None:
     for wrong, message in (
         ({"num_snapshots": 1}, "num_snapshots is 1"),
-        ({"leads_m": ()}, "leads_m is empty"),
+        ({"tag_offsets_m": ()}, "tag_offsets_m is empty"),
         ({"sigma_rad": 0.0}, "sigma_rad 0.0"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -395,13 +393,11 @@ def test_settings_are_checked() -> None:
 
 def _compose(name: str, *overrides: str) -> dict:
     with initialize_config_dir(str((ROOT / "conf").resolve()), version_base="1.3"):
-        values = OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
-    assert isinstance(values, dict)
-    return {key: value for key, value in values.items() if key != "paths"}
+        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)  # type: ignore[return-value]
 
 
 def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
-    values = _compose("tagvision", "suite=planar_tracks")
+    values = _compose("tagvision", "benchmark=planar_tracks")
     values.pop("progress")
     config = from_mapping(TagVisionExperiment, values)
     assert config.system.match == config.matching["adapted"]
@@ -409,7 +405,7 @@ def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
     assert config.system.blobs == BlobSettings()
     assert config.system.tracks == TrackSettings()
     assert from_mapping(CalibrateSettings, _compose("calibrate_camera", "pictures=here")).board == Board()
-    lines = dataclasses.replace(config, suite=None, num_calibrations=1, lines=config.lines[:2])
+    lines = dataclasses.replace(config, benchmark=None, num_calibrations=1, lines=config.lines[:2])
     metrics = run_tagvision(lines, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == json.loads(json.dumps(metrics))
     assert set(metrics["lines"]) == {"stated", "stated with unknown offset"}
@@ -419,23 +415,22 @@ def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
         dataclasses.replace(config, split="all")
 
 
-def test_a_suite_of_lines_has_nothing_that_moves_over_a_table(tmp_path: Path) -> None:
-    values = _compose("tagvision", "suite=planar_101", f"recordings_dir={tmp_path / 'recordings'}")
+def test_a_suite_of_lines_is_refused(tmp_path: Path) -> None:
+    values = _compose("tagvision", "benchmark=planar_101", f"out={tmp_path / 'recordings'}")
     values.pop("progress")
-    with pytest.raises(ConfigError, match=r"planar_101 has no pictures.*suite=planar_tracks"):
+    with pytest.raises(ConfigError, match=r"planar_101 has no pictures.*benchmark=planar_tracks"):
         run_tagvision(from_mapping(TagVisionExperiment, values), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_planar_tracks_run_whole(tmp_path: Path) -> None:
     values = _compose(
-        "tagvision", "suite=planar_tracks", "suite.duration_s=4.0", "suite.counts.test=1", "num_calibrations=1",
-        f"recordings_dir={tmp_path / 'recordings'}",
+        "tagvision", "benchmark=planar_tracks", "benchmark.duration_s=4.0", "benchmark.counts.test=1", "num_calibrations=1",
+        f"out={tmp_path / 'recordings'}",
     )  # fmt: skip
-    values["suite"]["counts"] |= {"train": 0, "validation": 0}
-    values["suite"]["variants"] = [one for one in values["suite"]["variants"] if one["name"] == "three"]
+    values["benchmark"]["counts"] |= {"train": 0, "validation": 0}
+    values["benchmark"]["variants"] = [one for one in values["benchmark"]["variants"] if one["name"] == "three"]
     values.pop("progress")
     metrics = run_tagvision(from_mapping(TagVisionExperiment, values), tmp_path / "run")
     tracks = metrics["tracks"]

@@ -13,29 +13,23 @@ import cv2
 import numpy as np
 import pytest
 
-from tagjax.baselines.tagvision import (
-    Board,
-    CalibrateSettings,
-    CalibrationError,
-    PlaneCamera,
-    PosePicture,
-    calibrate,
-    calibrate_folder,
-    find_corners,
-    load_camera,
-    locate,
-    read_picture,
-    save_camera,
-    write_calibration,
-    write_corners,
-)
-from tagjax.evaluation.tagvision import (
+from tagjax.baselines.tagvision import PlaneCamera, load_calibration, save_calibration
+from tagjax.baselines.tagvision.calibration import Board, CalibrationError, calibrate, camera_pose, find_corners
+from tagjax.baselines.tagvision.experiment.simulated_calibration import (
     PAPER_CAMERA,
     CalibrationSettings,
     board_views,
-    calibrated,
     overhead,
+    simulate_calibration,
     transform_error_m,
+)
+from tagjax.baselines.tagvision.picture_folder import (
+    CalibrateSettings,
+    PosePicture,
+    calibrate_folder,
+    read_picture,
+    write_calibration,
+    write_corners,
 )
 from tagjax.recording import Intrinsics
 
@@ -65,7 +59,7 @@ def test_plane_and_picture_are_inverse() -> None:
     np.testing.assert_allclose(ideal.to_plane(pixels)[:, :2], by_matrix, atol=1e-4)
 
 
-def test_what_is_not_in_front_is_nan() -> None:
+def test_points_behind_the_camera_are_nan() -> None:
     camera = _tilted()
     assert np.all(np.isnan(camera.to_plane(np.array([[300.0, 300.0]]), 3.0)))
     assert np.all(np.isnan(camera.to_picture(np.array([[0.0, 0.0, 9.0]]))))
@@ -99,7 +93,7 @@ def test_transform_error_is_below_the_papers() -> None:
     errors = []
     for seed in range(5):
         settings = CalibrationSettings(seed=seed)
-        found = calibrated(true, area, settings)
+        found = simulate_calibration(true, area, settings)
         errors.append(transform_error_m(found, true, area, pixel_noise_px=0.1, seed=seed).mean() * 1e3)
     assert np.mean(errors) <= 1.56
     assert max(errors) <= 1.56
@@ -107,7 +101,7 @@ def test_transform_error_is_below_the_papers() -> None:
     assert exact.max() < 1e-6
 
 
-def test_calibration_refuses_what_it_cannot_use() -> None:
+def test_calibration_refuses_unusable_views() -> None:
     settings = CalibrationSettings(corner_noise_px=0.0)
     views = board_views(PAPER_CAMERA, settings, np.random.default_rng(9))
     board = settings.board
@@ -125,17 +119,17 @@ def test_calibration_refuses_what_it_cannot_use() -> None:
         calibrate([np.full_like(view, np.nan) for view in views], board, 1280, 720)
     with pytest.raises(ValueError, match="num_radial is 1"):
         calibrate(views, board, 1280, 720, num_radial=1)
-    with pytest.raises(ValueError, match="as many both"):
+    with pytest.raises(ValueError, match="expected at least 3 each way and different numbers"):
         Board(6, 6)
     line = np.column_stack([np.arange(5.0), np.zeros(5), np.zeros(5)])
     with pytest.raises(CalibrationError, match="in line"):
-        locate(line, line[:, :2], PAPER_CAMERA)
-    with pytest.raises(CalibrationError, match="3 points"):
-        locate(board.corners_m()[:3], views[0][:3], PAPER_CAMERA)
+        camera_pose(line, line[:, :2], PAPER_CAMERA)
+    with pytest.raises(CalibrationError, match="Found 3 points"):
+        camera_pose(board.corners_m()[:3], views[0][:3], PAPER_CAMERA)
     points = board.corners_m()
     seen = overhead(PAPER_CAMERA, (0.0, 0.0, 1.0)).to_picture(points)
     with pytest.raises(CalibrationError, match="below the plane"):
-        locate(points * [1.0, -1.0, 1.0], seen, PAPER_CAMERA)
+        camera_pose(points * [1.0, -1.0, 1.0], seen, PAPER_CAMERA)
 
 
 def _draw_board(camera: PlaneCamera, board: Board, rng: np.random.Generator, origin_m=(0.0, 0.0)) -> np.ndarray:
@@ -202,12 +196,12 @@ def test_a_folder_of_pictures_is_calibrated(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.plane.position_m, above.position_m, atol=0.03)
     area = (0.0, -0.2, 0.3, 0.0)
     assert transform_error_m(found.plane, above, area).mean() < 1.56e-3
-    assert any("empty.png" in line for line in found.said())
-    assert any("reprojection error" in line for line in found.said())
+    assert any("empty.png" in line for line in found.summary())
+    assert any("reprojection error" in line for line in found.summary())
     assert [Path(seen.picture).name for seen in found.boards] == ["table0.png", "table1.png"]
-    assert not any("doubtful" in line for line in found.said())
+    assert not any("doubtful" in line for line in found.summary())
     write_calibration(found, tmp_path / "camera.json")
-    read = load_camera(tmp_path / "camera.json")
+    read = load_calibration(tmp_path / "camera.json")
     np.testing.assert_allclose(read.rotation, found.plane.rotation)
     assert read.intrinsics == found.camera.intrinsics
 
@@ -220,19 +214,19 @@ def test_a_folder_of_pictures_is_calibrated(tmp_path: Path) -> None:
         assert np.any(np.abs(drawn[:, 808 * number :][:, :800].astype(int) - np.array([220, 40, 40])).max(axis=-1) < 9)
 
     away = dataclasses.replace(poses[1], origin_m=(0.25, -0.06))
-    doubtful = calibrate_folder(CalibrateSettings(str(folder), poses=(poses[0], away))).said()
+    doubtful = calibrate_folder(CalibrateSettings(str(folder), poses=(poses[0], away))).summary()
     assert sum("table" in line and "origin_m and turn_deg right, the board's size" in line for line in doubtful) == 2
 
     settings = CalibrateSettings(str(folder), board=Board(9, 5))
     with pytest.raises(CalibrationError, match="none of 7 pictures shows a board of 9 x 5 squares"):
         calibrate_folder(settings)
     write_calibration(dataclasses.replace(found, plane=None), tmp_path / "camera.json")
-    with pytest.raises(ValueError, match=r"holds intrinsics only.*poses=\[\{picture"):
-        load_camera(tmp_path / "camera.json")
+    with pytest.raises(ValueError, match=r"found intrinsics only.*poses=\[\{picture"):
+        load_calibration(tmp_path / "camera.json")
 
 
 @pytest.mark.ci
-def test_the_command_reports_or_says_what_is_wrong(tmp_path: Path) -> None:
+def test_the_command_reports_the_result_or_the_error(tmp_path: Path) -> None:
     rng, run = np.random.default_rng(12), [sys.executable, "-m", "experiments.calibrate_camera"]
     for seed in range(4):
         cv2.imwrite(str(tmp_path / f"{seed}.png"), _draw_board(_held(seed), Board(), rng))
@@ -244,7 +238,7 @@ def test_the_command_reports_or_says_what_is_wrong(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "new" / "camera.json").read_text())["intrinsics_reprojection_px"] < 0.15
     failed = subprocess.run([*run, given[2]], capture_output=True, text=True, cwd=ROOT)
     assert failed.returncode == 1
-    assert "expected pictures=<folder" in failed.stderr
+    assert "give pictures=<folder" in failed.stderr
 
 
 def test_folders_that_cannot_be_calibrated_are_refused(tmp_path: Path) -> None:
@@ -268,19 +262,19 @@ def test_folders_that_cannot_be_calibrated_are_refused(tmp_path: Path) -> None:
 
 def test_a_calibration_file_is_read_back_or_refused(tmp_path: Path) -> None:
     camera, path = _tilted(), tmp_path / "camera.json"
-    save_camera(camera, path, source="a test")
-    again = load_camera(path)
+    save_calibration(camera, path, source="a test")
+    again = load_calibration(path)
     np.testing.assert_allclose(again.rotation, camera.rotation)
     assert again.intrinsics == camera.intrinsics
     with pytest.raises(ValueError, match="no readable calibration"):
-        load_camera(tmp_path / "none.json")
+        load_calibration(tmp_path / "none.json")
     values = json.loads(path.read_text())
     path.write_text(json.dumps({**values, "format": "other"}))
     with pytest.raises(ValueError, match="no calibration of format"):
-        load_camera(path)
+        load_calibration(path)
     path.write_text(json.dumps({**values, "rotation": [[1, 0, 0]] * 3}))
     with pytest.raises(ValueError, match="damaged"):
-        load_camera(path)
+        load_calibration(path)
 
 
 @pytest.mark.parametrize(
@@ -310,9 +304,9 @@ def test_a_calibration_file_is_read_back_or_refused(tmp_path: Path) -> None:
 )
 def test_a_damaged_calibration_file_is_refused_by_name(tmp_path: Path, name: str, value: object) -> None:
     path = tmp_path / "camera.json"
-    save_camera(_tilted(), path)
+    save_calibration(_tilted(), path)
     values = json.loads(path.read_text())
     (values if name in values else values["intrinsics"])[name] = value
     path.write_text(json.dumps(values))
     with pytest.raises(ValueError, match=r"camera\.json: damaged calibration"):
-        load_camera(path)
+        load_calibration(path)

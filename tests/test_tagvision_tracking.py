@@ -10,19 +10,12 @@ import numpy as np
 import pytest
 import tagvision_scenes as scenes
 
-from tagjax.baselines import Claim, HostCamera, claims_to_trace, host_frames, host_trace
-from tagjax.baselines.tagvision import (
-    BlobSettings,
-    MatchSettings,
-    TagVision,
-    TagVisionSettings,
-    Tracks,
-    TrackSettings,
-    backward_flow,
-    find_blobs,
-    follow,
-)
-from tagjax.evaluation.tagvision import PAPER_CAMERA, overhead
+from tagjax.baselines import Detection, HostCamera, host_frames, host_trace, trace_from_detections
+from tagjax.baselines.tagvision import TagVisionSettings, TagVisionTracer
+from tagjax.baselines.tagvision.detection import BlobSettings, backward_flow, find_blobs
+from tagjax.baselines.tagvision.experiment.simulated_calibration import PAPER_CAMERA, overhead
+from tagjax.baselines.tagvision.matching import MatchSettings
+from tagjax.baselines.tagvision.tracks import Tracks, TrackSettings, track_blobs
 from tagjax.metrics import recordings as evaluate
 from tagjax.recording import Recording, RecordingError, TagReads
 
@@ -63,15 +56,15 @@ def test_blobs_have_a_size_and_a_speed() -> None:
     pictures = scenes.picture(STILL, rng), scenes.picture(STILL + 0.05, rng)
     area = np.pi * scenes.RADIUS_M**2
     assert len(_blobs(*pictures, BlobSettings())) == 2
-    assert _blobs(*pictures, BlobSettings(least_area_m2=2 * area, most_area_m2=1.0)) == []
-    assert _blobs(*pictures, BlobSettings(least_area_m2=0.001, most_area_m2=0.5 * area)) == []
-    assert _blobs(*pictures, BlobSettings(most_speed_m_s=0.5)) == []
-    assert _blobs(*pictures, BlobSettings(least_speed_m_s=2.0)) == []
-    with pytest.raises(ValueError, match="least_area_m2"):
-        BlobSettings(least_area_m2=1.0)
+    assert _blobs(*pictures, BlobSettings(min_area_m2=2 * area, max_area_m2=1.0)) == []
+    assert _blobs(*pictures, BlobSettings(min_area_m2=0.001, max_area_m2=0.5 * area)) == []
+    assert _blobs(*pictures, BlobSettings(max_speed_m_s=0.5)) == []
+    assert _blobs(*pictures, BlobSettings(min_speed_m_s=2.0)) == []
+    with pytest.raises(ValueError, match="min_area_m2"):
+        BlobSettings(min_area_m2=1.0)
 
 
-def test_shadows_are_no_part_of_a_blob() -> None:
+def test_shadows_are_removed_from_blobs() -> None:
     rng = np.random.default_rng(16)
     step = np.array([0.05, 0.02])
     before, now = (scenes.picture(STILL + shift, rng, shadow_px=6.0) for shift in (0 * step, step))
@@ -82,7 +75,7 @@ def test_shadows_are_no_part_of_a_blob() -> None:
         return max(min(float(np.linalg.norm(blob.centre_px - c)) for blob in found) for c in centres)
 
     assert error(BlobSettings()) < 0.6
-    assert error(BlobSettings(shadows=False, most_area_m2=0.5)) > 1.0
+    assert error(BlobSettings(remove_shadows=False, max_area_m2=0.5)) > 1.0
 
 
 def _walk(num_frames: int) -> np.ndarray:
@@ -96,10 +89,10 @@ def _walk(num_frames: int) -> np.ndarray:
 
 def _followed(paths: np.ndarray, settings: TrackSettings | None = None) -> list[Tracks]:
     rng, state, states = np.random.default_rng(17), Tracks(), []
-    pictures = [scenes.picture(places, rng) for places in paths]
+    pictures = [scenes.picture(positions, rng) for positions in paths]
     for number, picture in enumerate(pictures):
         blobs = _blobs(pictures[number - 2], picture, BlobSettings()) if number >= 2 else []
-        state = follow(state, picture, blobs, number / 30, settings or TrackSettings())
+        state = track_blobs(state, picture, blobs, number / 30, settings or TrackSettings())
         states.append(state)
     return states
 
@@ -107,7 +100,7 @@ def _followed(paths: np.ndarray, settings: TrackSettings | None = None) -> list[
 def test_tracks_keep_their_numbers_past_others_and_while_still() -> None:
     paths = _walk(60)
     states = _followed(paths)
-    truth = np.stack([scenes.OVER.to_picture(np.column_stack([places, np.zeros(3)])) for places in paths])
+    truth = np.stack([scenes.OVER.to_picture(np.column_stack([positions, np.zeros(3)])) for positions in paths])
     owners = []
     for number in (6, 25, 30, 35, 59):
         tracks = states[number].tracks
@@ -117,7 +110,7 @@ def test_tracks_keep_their_numbers_past_others_and_while_still() -> None:
         owners.append([tracks[i].number for i in away.argmin(axis=1)])
     assert all(one == owners[0] for one in owners)
     assert len(set(owners[0])) == 3
-    # The third stands since frame 24: no blob, but its colours are still there.
+    # The third stands still since frame 24: no blob, but its colours support it.
     still = next(track for track in states[-1].tracks if track.number == owners[0][2])
     assert still.is_seen()
     assert still.blob_s < 1.2
@@ -128,13 +121,13 @@ def test_a_track_without_support_ends() -> None:
     rng, states = np.random.default_rng(18), _followed(paths)
     state, empty = states[-1], scenes.picture(np.empty((0, 2)), rng)
     assert len(state.tracks) == 3
-    settings = TrackSettings(patience_s=0.2)
+    settings = TrackSettings(max_unseen_s=0.2)
     for number in range(20, 25):
-        state = follow(state, empty, [], number / 30, settings)
+        state = track_blobs(state, empty, [], number / 30, settings)
         assert not any(track.is_seen() for track in state.tracks)
         assert not any(track.full_mask((scenes.HEIGHT, scenes.WIDTH)).any() for track in state.tracks)
     for number in range(25, 28):
-        state = follow(state, empty, [], number / 30, settings)
+        state = track_blobs(state, empty, [], number / 30, settings)
     assert state.tracks == ()
     assert state.next_number == states[-1].next_number
 
@@ -151,13 +144,13 @@ SYSTEM = TagVisionSettings(match=dataclasses.replace(QUICK, pairing="interpolate
 
 
 @pytest.fixture(scope="module")
-def said(drawn: Recording) -> list:
-    return list(host_trace(TagVision(scenes.OVER, SYSTEM), drawn))
+def traces(drawn: Recording) -> list:
+    return list(host_trace(TagVisionTracer(scenes.OVER, SYSTEM), drawn))
 
 
-def test_the_system_finds_names_and_outlines_what_is_tagged(drawn: Recording, said: list) -> None:
+def test_the_system_detects_and_identifies_tagged_objects(drawn: Recording, traces: list) -> None:
     assert drawn.truth is not None
-    late = [(number, trace) for number, trace in said if number >= 40]
+    late = [(number, trace) for number, trace in traces if number >= 40]
     for number, trace in late:
         for tag, epc in enumerate(scenes.EPCS):
             assert trace.detected[tag]
@@ -172,14 +165,14 @@ def test_the_system_finds_names_and_outlines_what_is_tagged(drawn: Recording, sa
             assert 0.5 < trace.confidence[tag] <= 1
     antenna = np.asarray(drawn.antennas_m[0])
     true_steps = np.diff(np.linalg.norm(drawn.truth.tag_position_m[scenes.EPCS[0]] - antenna, axis=1))[40:]
-    steps = np.array([trace.step_m[0, 0] for number, trace in said if number >= 41])
+    steps = np.array([trace.step_m[0, 0] for number, trace in traces if number >= 41])
     assert np.corrcoef(steps, true_steps)[0, 1] > 0.7
 
 
-def test_it_is_scored_by_the_same_code(drawn: Recording) -> None:
+def test_its_traces_are_scored_by_the_same_code(drawn: Recording) -> None:
     settings = evaluate.ScoreSettings(moved_for_s=1.0, num_pictures=1)
     names = drawn.resolve_epcs(None)
-    traces = host_trace(TagVision(scenes.OVER, SYSTEM), drawn, epcs=names)
+    traces = host_trace(TagVisionTracer(scenes.OVER, SYSTEM), drawn, epcs=names)
     result = evaluate.score_traces(traces, drawn, names, settings=settings)
     scores = result.scores().result()
     assert (scores["iou"] or 0) > 0.7
@@ -187,38 +180,41 @@ def test_it_is_scored_by_the_same_code(drawn: Recording) -> None:
     assert (scores["cle_px"] or 99) < 5
 
 
-def test_the_future_changes_nothing(drawn: Recording, said: list) -> None:
-    part = list(host_trace(TagVision(scenes.OVER, SYSTEM), drawn, frames=(0, 35)))
-    for (number, one), (other, two) in zip(part, said, strict=False):
+def test_later_frames_change_nothing(drawn: Recording, traces: list) -> None:
+    part = list(host_trace(TagVisionTracer(scenes.OVER, SYSTEM), drawn, frames=(0, 35)))
+    for (number, one), (other, two) in zip(part, traces, strict=False):
         assert number == other
         for mine, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
             np.testing.assert_array_equal(mine, theirs)
 
 
-def test_steps_leave_the_state_they_are_given_alone(drawn: Recording) -> None:
-    tracer, setup = TagVision(scenes.OVER, SYSTEM), HostCamera(scenes.FLAT, np.asarray(drawn.antennas_m), scenes.EPCS)
+def test_steps_do_not_modify_the_given_state(drawn: Recording) -> None:
+    tracer, setup = (
+        TagVisionTracer(scenes.OVER, SYSTEM),
+        HostCamera(scenes.FLAT, np.asarray(drawn.antennas_m), scenes.EPCS),
+    )
 
     def sizes(state) -> tuple[int, ...]:
-        return len(state.places), len(state.read_time_s), len(state.tracks.tracks), len(state.pictures)
+        return len(state.positions), len(state.read_time_s), len(state.tracks.tracks), len(state.pictures)
 
     state, kept = tracer.init(setup), []
     for frame in host_frames(drawn, scenes.EPCS, (0, 12)):
         kept.append((state, sizes(state)))
         state, _ = tracer.step(setup, state, frame)
-    assert all(sizes(before) == said for before, said in kept)
+    assert all(sizes(before) == size for before, size in kept)
     finished = tracer.finish(state)
     assert finished.pictures == ()
     assert finished.tracks is state.tracks
 
 
 def test_memory_is_bounded(drawn: Recording) -> None:
-    tracer = TagVision(scenes.OVER, dataclasses.replace(SYSTEM, memory_s=0.5))
+    tracer = TagVisionTracer(scenes.OVER, dataclasses.replace(SYSTEM, memory_s=0.5))
     setup = HostCamera(scenes.FLAT, np.asarray(drawn.antennas_m), scenes.EPCS)
     state = tracer.init(setup)
     for frame in host_frames(drawn, scenes.EPCS, (0, 30)):
         state, _ = tracer.step(setup, state, frame)
-    assert len(state.places) <= 16
-    newest_s = max(time_s for time_s, _ in state.places)
+    assert len(state.positions) <= 16
+    newest_s = max(time_s for time_s, _ in state.positions)
     assert state.read_time_s.min() >= newest_s - 0.5
     assert len(state.pictures) <= 4
 
@@ -236,22 +232,22 @@ def test_frames_bring_every_read_once(drawn: Recording) -> None:
         next(host_frames(drawn, scenes.EPCS, (0, 99)))
 
 
-def test_where_the_method_cannot_apply_it_says_why(drawn: Recording) -> None:
-    def reason(tracer: TagVision, recording: Recording = drawn) -> str:
-        said = tracer.inapplicable(recording)
-        assert said is not None
-        return said
+def test_where_the_method_does_not_apply_the_reason_is_given(drawn: Recording) -> None:
+    def reason(tracer: TagVisionTracer, recording: Recording = drawn) -> str:
+        found = tracer.inapplicable(recording)
+        assert found is not None
+        return found
 
-    assert TagVision(scenes.OVER).inapplicable(drawn) is None
-    assert "no calibration" in reason(TagVision(None))
-    assert "1280 x 720" in reason(TagVision(overhead(PAPER_CAMERA, (0.0, 0.0, 2.0))))
-    assert "antenna 2 has no known place" in reason(TagVision(scenes.OVER, TagVisionSettings(antenna=2)))
+    assert TagVisionTracer(scenes.OVER).inapplicable(drawn) is None
+    assert "no calibration" in reason(TagVisionTracer(None))
+    assert "1280 x 720" in reason(TagVisionTracer(overhead(PAPER_CAMERA, (0.0, 0.0, 2.0))))
+    assert "antenna 2 has no known position" in reason(TagVisionTracer(scenes.OVER, TagVisionSettings(antenna=2)))
     unknown = dataclasses.replace(drawn.reads, carrier_hz=np.full(drawn.reads.num_reads, np.nan))
-    assert "known carrier" in reason(TagVision(scenes.OVER), drawn.with_reads(unknown))
-    with pytest.raises(RecordingError, match="TagVision does not apply: no calibration"):
-        next(host_trace(TagVision(None), drawn))
+    assert "known carrier" in reason(TagVisionTracer(scenes.OVER), drawn.with_reads(unknown))
+    with pytest.raises(RecordingError, match="TagVisionTracer does not apply: no calibration"):
+        next(host_trace(TagVisionTracer(None), drawn))
     with pytest.raises(RecordingError, match="no tag to trace"):
-        next(host_trace(TagVision(scenes.OVER), drawn.with_reads(TagReads.empty())))
+        next(host_trace(TagVisionTracer(scenes.OVER), drawn.with_reads(TagReads.empty())))
 
 
 def _damaged(drawn: Recording, part: str) -> Recording:
@@ -285,12 +281,12 @@ def _damaged(drawn: Recording, part: str) -> Recording:
 )
 def test_a_damaged_recording_is_refused(drawn: Recording, part: str, message: str) -> None:
     with pytest.raises(RecordingError, match=message):
-        next(host_trace(TagVision(scenes.OVER), _damaged(drawn, part)))
+        next(host_trace(TagVisionTracer(scenes.OVER), _damaged(drawn, part)))
 
 
 def test_depth_may_be_missing(drawn: Recording) -> None:
     blind = dataclasses.replace(drawn, depth=np.zeros_like(drawn.depth))
-    assert next(host_trace(TagVision(scenes.OVER), blind))[0] == 0
+    assert next(host_trace(TagVisionTracer(scenes.OVER), blind))[0] == 0
 
 
 def test_blobs_without_tags_and_tags_without_blobs() -> None:
@@ -306,22 +302,22 @@ def test_blobs_without_tags_and_tags_without_blobs() -> None:
         reads=reads,
         antennas_m=scenes.OVER.to_camera(scenes.ANTENNA[None]),
     )
-    for _, trace in host_trace(TagVision(scenes.OVER, SYSTEM), recording):
+    for _, trace in host_trace(TagVisionTracer(scenes.OVER, SYSTEM), recording):
         assert not trace.detected.any()
         assert not trace.mask.any()
         assert not trace.confidence.any()
 
 
-def test_claims_become_a_trace() -> None:
+def test_detections_become_a_trace() -> None:
     mask = np.zeros((6, 8), bool)
     mask[2:4, 3:7] = True
-    empty = Claim(np.zeros((6, 8), bool), np.zeros(3), 0.9)
-    boxed = Claim(mask, np.array([1.0, 2.0, 3.0]), 0.3, box_px=np.array([0.0, 1.0, 2.0, 3.0]), step_m=0.1)
-    trace = claims_to_trace([Claim(mask, np.full(3, np.nan), 0.8), None, empty, boxed], (6, 8))
+    empty = Detection(np.zeros((6, 8), bool), np.zeros(3), 0.9)
+    boxed = Detection(mask, np.array([1.0, 2.0, 3.0]), 0.3, box_px=np.array([0.0, 1.0, 2.0, 3.0]), step_m=0.1)
+    trace = trace_from_detections([Detection(mask, np.full(3, np.nan), 0.8), None, empty, boxed], (6, 8))
     assert trace.detected.tolist() == [True, False, False, True]
     assert trace.box_px[0].tolist() == [3, 2, 6, 3]
     assert trace.centre_px[0].tolist() == [4.5, 2.5]
     assert trace.box_px[3].tolist() == [0, 1, 2, 3]
     assert float(trace.confidence[2]) == 0.0
     assert float(trace.step_m[3, 0]) == pytest.approx(0.1)
-    assert claims_to_trace([], (6, 8)).mask.shape == (0, 6, 8)
+    assert trace_from_detections([], (6, 8)).mask.shape == (0, 6, 8)

@@ -1,12 +1,14 @@
-"""The systems that came before TagAttention, each whole: from raw recordings to its own paper's tables.
+"""The systems published before TagAttention, each from raw recordings to the tables of its own paper.
 
-`host_trace` runs one over a recording, frame by frame; `AbstractHostTracer` is what each of them is.
+Each package has the same inside: `tracer` (the system), `detection`, `tracks` and `matching` (its method),
+`calibration` or `training`, `experiment` (the paper's tables; needs recordings) and `figures` (needs matplotlib).
+`host_trace` runs any of them over a recording; `AbstractHostTracer` is their common interface.
 """
 
-from ._interface import AbstractHostTracer as AbstractHostTracer
-from ._interface import Claim as Claim
-from ._interface import HostCamera as HostCamera
-from ._interface import HostFrame as HostFrame
-from ._interface import claims_to_trace as claims_to_trace
-from ._interface import host_frames as host_frames
-from ._interface import host_trace as host_trace
+from .host_tracer import AbstractHostTracer as AbstractHostTracer
+from .host_tracer import Detection as Detection
+from .host_tracer import HostCamera as HostCamera
+from .host_tracer import HostFrame as HostFrame
+from .host_tracer import host_frames as host_frames
+from .host_tracer import host_trace as host_trace
+from .host_tracer import trace_from_detections as trace_from_detections

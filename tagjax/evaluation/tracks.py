@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from ..baselines.tagview import ReadSettings, fit_pairs, hear
-from ..baselines.tagvision import Snapshots, match_scores
+from ..baselines.tagview.line_fit import fit_pairs
+from ..baselines.tagview.sequences import ReadSettings, tag_measurements
+from ..baselines.tagvision.phase_score import Snapshots, match_scores
 from ..radio.channels import estimate_slope
 from ..radio.reader import ReaderSettings
 from ..recording import RecordingError, TagReads
@@ -205,12 +206,12 @@ def association_scores(window: Window, *, seed: int = 0) -> dict[str, Float[np.n
         snapshots,
         key=jax.random.key(seed),
         num_rounds=30,
-        multiple=2 if flips else 1,
+        angle_multiple=2 if flips else 1,
         hop_slope_rad_hz=jnp.asarray(slope, jnp.float32),
     )
-    said = hear([_EPC], window.reads, stamp, window.time_s, ReadSettings()).sequences
+    said = tag_measurements([_EPC], window.reads, stamp, window.time_s, ReadSettings()).sequences
     # Tagview's factor is the distance in units of the antenna's height; R^2 does not ask for the unit.
-    fit = fit_pairs(distance, jnp.ones(distance.shape, bool), said.phase_rad, said.heard, said.piece)
+    fit = fit_pairs(distance, jnp.ones(distance.shape, bool), said.phase_rad, said.phase_known, said.piece)
     line = jnp.where(fit.slope[:, 0] > 0, fit.r_squared[:, 0], 0.0)
     return dict(
         zip(METHODS, (np.asarray(x, np.float64) for x in (coherent, plain, attended, vision, line)), strict=True)

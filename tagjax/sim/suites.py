@@ -20,13 +20,12 @@ import numpy as np
 
 from ..recording import RecordingError
 from ..recording.store import save_recording
+from ..recording.suite_folder import SPLITS
 from .radio.inventory import InventorySettings
 from .radio.planar import PlanarSettings, planar_trials, save_planar
 from .record import CaptureSettings, simulate_recording
 from .stories import STORIES, build_scenario
 from .stories.scenario import Scenario
-
-SPLITS = ("train", "validation", "test")
 
 PLANAR = "planar_101"
 """The only story without pictures."""

@@ -1,49 +1,10 @@
-"""Goller et al. (IEEE RFID 2014): antenna mixture, motion blobs, HMM association and an alarm at the exit."""
+"""Goller et al. (IEEE RFID 2014): antenna mixture, motion blobs, HMM association and an alarm at the exit.
 
-from ._alarm import Roc as Roc
-from ._alarm import best_threshold as best_threshold
-from ._alarm import exit_score as exit_score
-from ._alarm import operating_point as operating_point
-from ._alarm import roc_curve as roc_curve
-from ._alarm import rssi_score as rssi_score
-from ._antennas import AntennaModel as AntennaModel
-from ._antennas import antenna_weights as antenna_weights
-from ._antennas import covariance_m2 as covariance_m2
-from ._antennas import fit_antennas as fit_antennas
-from ._antennas import mixture_likelihood as mixture_likelihood
-from ._antennas import response_db as response_db
-from ._association import AssociationModel as AssociationModel
-from ._association import Associations as Associations
-from ._association import assignment_row as assignment_row
-from ._association import associate as associate
-from ._association import forward_filter as forward_filter
-from ._association import make_association as make_association
-from ._blobs import BlobSettings as BlobSettings
-from ._blobs import BlobTracker as BlobTracker
-from ._blobs import BlobTracks as BlobTracks
-from ._fit import Carried as Carried
-from ._fit import carried as carried
-from ._fit import fit_association as fit_association
-from ._fit import true_states as true_states
-from ._location import FloorGrid as FloorGrid
-from ._location import Location as Location
-from ._location import LocationModel as LocationModel
-from ._location import locate as locate
-from ._location import make_grid as make_grid
-from ._location import make_location as make_location
-from ._reads import GridStatistic as GridStatistic
-from ._reads import grid_statistic as grid_statistic
-from ._site import Site as Site
-from ._site import find_site as find_site
-from ._system import Calibration as Calibration
-from ._system import GollerSettings as GollerSettings
-from ._system import Observations as Observations
-from ._system import Prepared as Prepared
-from ._system import calibrate as calibrate
-from ._system import decide as decide
-from ._system import load_calibration as load_calibration
-from ._system import observe as observe
-from ._system import peak as peak
-from ._system import prepared as prepared
-from ._system import save_calibration as save_calibration
-from ._tracer import GollerTracer as GollerTracer
+`experiment` holds the paper's tables, `figures` its plots; both are imported by name.
+"""
+
+from .calibration import Calibration as Calibration
+from .calibration import load_calibration as load_calibration
+from .calibration import save_calibration as save_calibration
+from .settings import GollerSettings as GollerSettings
+from .tracer import GollerTracer as GollerTracer

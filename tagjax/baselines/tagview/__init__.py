@@ -1,55 +1,9 @@
-"""Tagview (Duan et al., INFOCOM 2020): camera and antenna at the ceiling, phase linear in the translating factor."""
+"""Tagview (Duan et al., INFOCOM 2020): camera and antenna at the ceiling, phase linear in the translating factor.
 
-from ._agreement import agreement as agreement
-from ._agreement import shared_times as shared_times
-from ._boxes import from_inclusive as from_inclusive
-from ._boxes import middle_px as middle_px
-from ._boxes import overlap as overlap
-from ._boxes import suppress as suppress
-from ._detect import AbstractDetector as AbstractDetector
-from ._detect import BoxDetector as BoxDetector
-from ._detect import DetectorSettings as DetectorSettings
-from ._detect import MotionDetector as MotionDetector
-from ._detect import make_detector as make_detector
-from ._fit import LineFit as LineFit
-from ._fit import fit_line as fit_line
-from ._fit import fit_pairs as fit_pairs
-from ._fit import translating_factor as translating_factor
-from ._graph import SLOPE_OUTLIER_NATS as SLOPE_OUTLIER_NATS
-from ._graph import Coefficient as Coefficient
-from ._graph import cliques as cliques
-from ._graph import edge_agreement as edge_agreement
-from ._graph import keep_edges as keep_edges
-from ._graph import likelihood_weight as likelihood_weight
-from ._graph import match_graph as match_graph
-from ._graph import shared_coefficient as shared_coefficient
-from ._graph import slope_log_odds as slope_log_odds
-from ._hermite import interpolate as interpolate
-from ._match import Identification as Identification
-from ._match import MatchSettings as MatchSettings
-from ._match import Traces as Traces
-from ._match import identify as identify
-from ._network import BoxNetwork as BoxNetwork
-from ._phase import pieces as pieces
-from ._phase import splice_phase as splice_phase
-from ._programme import Selection as Selection
-from ._programme import select_edges as select_edges
-from ._reads import Heard as Heard
-from ._reads import ReadSettings as ReadSettings
-from ._reads import TagSequences as TagSequences
-from ._reads import hear as hear
-from ._sort import BoxTrack as BoxTrack
-from ._sort import BoxTracks as BoxTracks
-from ._sort import SortSettings as SortSettings
-from ._sort import track_boxes as track_boxes
-from ._tracer import TagviewSettings as TagviewSettings
-from ._tracer import TagviewTracer as TagviewTracer
-from ._tracer import undistorted as undistorted
-from ._training import LabelledFrame as LabelledFrame
-from ._training import TrainSettings as TrainSettings
-from ._training import detection_loss as detection_loss
-from ._training import labelled_frames as labelled_frames
-from ._training import measure_detector as measure_detector
-from ._training import train_detector as train_detector
-from ._weights import load_detector as load_detector
-from ._weights import save_detector as save_detector
+`experiment` holds the paper's tables, `figures` its plots; both are imported by name.
+"""
+
+from .settings import TagviewSettings as TagviewSettings
+from .tracer import TagviewTracer as TagviewTracer
+from .weights import load_weights as load_weights
+from .weights import save_weights as save_weights

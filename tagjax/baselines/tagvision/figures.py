@@ -1,4 +1,4 @@
-"""Plots of TagVision's experiments: scores of lines (Fig. 6), matching by time observed, tracking errors. Needs viz."""
+"""Plots: scores of lines (Fig. 6), matching by time observed, tracking errors. Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def line_plot(
     panels: Sequence[tuple[str, Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]],
     true_m: float = 0.0,
 ) -> None:
-    """Normalised score of every line, one panel a case: (title, one round, mean of all rounds)."""
+    """Normalised score of every line, one panel per case: (title, one round, mean of all rounds)."""
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     figure = blank(4.3 * columns, 2.9 * rows)
@@ -36,17 +36,13 @@ def line_plot(
     figure.savefig(path, dpi=110)
 
 
-def matching_plot(
-    path: Path, share: Mapping[str, Mapping[float, float]], *, chance: float | None = None, target: float = 0.98
-) -> None:
-    """Share of tags matched to the right object against the time observed, one line a setting."""
+def matching_plot(path: Path, matched: Mapping[str, Mapping[float, float]], *, target: float = 0.98) -> None:
+    """Fraction of tags matched to the right object against the time observed, one line per setting."""
     figure = blank(5.5, 3.4)
     axes = figure.subplots()
-    for name, line in share.items():
+    for name, line in matched.items():
         axes.plot(list(line), list(line.values()), marker="o", markersize=4, linewidth=1.4, label=name)
     axes.axhline(target, color="0.3", linewidth=0.8, linestyle=":", label=f"the paper's {target:g}")
-    if chance is not None:
-        axes.axhline(chance, color="tab:red", linewidth=0.8, linestyle=":", label="chance")
     axes.set(xlabel="observed for (s)", ylabel="tags matched to the right object", ylim=(0, 1.03))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
@@ -56,20 +52,20 @@ def matching_plot(
 def error_plot(
     path: Path, errors_mm: Mapping[str, Shaped[np.ndarray, " values"]], *, target_mm: float | None = None
 ) -> None:
-    """Cumulative distribution of errors, one line a kind."""
+    """Cumulative distribution of errors, one line per kind."""
     figure = blank(5.5, 3.4)
     axes = figure.subplots()
-    most = 1.0
+    limit = 1.0
     for name, values in errors_mm.items():
         if not len(values):
             continue
         ordered = np.sort(np.asarray(values, np.float64))
-        share = np.arange(1, len(ordered) + 1) / len(ordered)
-        axes.plot(ordered, share, linewidth=1.4, label=f"{name} (mean {ordered.mean():.2f} mm)")
-        most = max(most, float(np.quantile(ordered, 0.99)))
+        fraction = np.arange(1, len(ordered) + 1) / len(ordered)
+        axes.plot(ordered, fraction, linewidth=1.4, label=f"{name} (mean {ordered.mean():.2f} mm)")
+        limit = max(limit, float(np.quantile(ordered, 0.99)))
     if target_mm is not None:
         axes.axvline(target_mm, color="0.3", linewidth=0.8, linestyle=":", label=f"the paper's mean {target_mm:g} mm")
-    axes.set(xlabel="error (mm)", ylabel="share of frames", xlim=(0, 1.3 * most), ylim=(0, 1.01))
+    axes.set(xlabel="error (mm)", ylabel="fraction of frames", xlim=(0, 1.3 * limit), ylim=(0, 1.01))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, loc="lower right")
     figure.savefig(path, dpi=110)

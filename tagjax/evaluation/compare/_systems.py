@@ -7,10 +7,13 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ...baselines._interface import host_trace
-from ...baselines.goller import Calibration, GollerSettings, GollerTracer, calibrate, load_calibration
+from ...baselines import host_trace
+from ...baselines.goller import Calibration, GollerSettings, GollerTracer, load_calibration
+from ...baselines.goller.calibration import calibrate
 from ...baselines.tagview import TagviewSettings, TagviewTracer
-from ...baselines.tagvision import PlaneCamera, TagVision, TagVisionSettings
+from ...baselines.tagvision import PlaneCamera, TagVisionSettings, TagVisionTracer
+from ...baselines.tagvision.experiment.simulated_calibration import CalibrationSettings, simulate_calibration
+from ...baselines.tagvision.experiment.table_truth import table_truth
 from ...core.settings import ConfigError
 from ...metrics.recordings import ScoreSettings
 from ...recording import Recording, RecordingError
@@ -20,7 +23,6 @@ from ...tagattention.tracer_settings import make_tracer, tracer_clips
 from ...tracing.clips import clip_loader
 from ...tracing.recordings import trace_recording
 from ...tracing.tracer import AbstractTracer, Trace
-from ..tagvision import CalibrationSettings, calibrated, table_truth
 
 Traces = Iterator[tuple[int, Trace]]
 
@@ -132,12 +134,12 @@ class Systems:
     def _plane(self, item: Item, recording: Recording) -> PlaneCamera:
         """The camera as it was calibrated on the table, which both TagVision and Tagview take."""
         truth = table_truth(item, recording)
-        return calibrated(truth.camera, truth.area_m, self.settings.tagvision_calibration)
+        return simulate_calibration(truth.camera, truth.area_m, self.settings.tagvision_calibration)
 
-    def _tagvision(self, item: Item, recording: Recording) -> TagVision:
+    def _tagvision(self, item: Item, recording: Recording) -> TagVisionTracer:
         if item.suite.story != TABLE:
             raise RecordingError("no calibrated plane: things do not move on one")
-        return TagVision(self._plane(item, recording), self.settings.tagvision)
+        return TagVisionTracer(self._plane(item, recording), self.settings.tagvision)
 
     def _tagview(self, item: Item, recording: Recording) -> TagviewTracer:
         settings = self.settings.tagview
@@ -159,4 +161,4 @@ class Systems:
                     "`python -m experiments.simulate suite=shop_grid` makes one"
                 )
             self._calibration = calibrate(open_recording(Path(grid)))
-        return GollerTracer(self._calibration, self.settings.goller).at(recording)
+        return GollerTracer(self._calibration, self.settings.goller).install(recording)
