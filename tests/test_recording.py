@@ -223,7 +223,7 @@ def test_numpy_values_in_attributes_are_made_plain(recording, tmp_path):
     ("part", "change", "message"),
     [
         ("truth", {"tag_to_label": {"tag-a": {1, 2}}}, r"truth\['tag_to_label'\]\['tag-a'\] holds \{1, 2\} \(set\)"),
-        ("truth", {"tag_to_label": {3: 1}}, "the key 3; expected names"),
+        ("truth", {"tag_to_label": {3: 1}}, "the key 3; expected strings"),
         ("truth", {"visible": {1: np.array(["yes"])}}, "truth/visible/0 holds <U3"),
         ("clock", {"offset_s": 1j}, r"clock\['offset_s'\] holds 1j"),
         ("reads", {"antenna": np.array([None])}, "reads/antenna holds object"),

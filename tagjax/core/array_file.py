@@ -1,4 +1,4 @@
-"""PyTrees of arrays in safetensors files, with JSON metadata that says what the arrays are and how they were made.
+"""PyTrees of arrays in safetensors files, with JSON metadata about the arrays and their origin.
 
 Nothing in a file is executed. Names, shapes and dtypes are compared with the expected tree before any value is read.
 """

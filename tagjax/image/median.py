@@ -31,12 +31,12 @@ def _comparisons(count: int, wanted: int) -> tuple[tuple[int, int], ...]:
 
     Batcher's odd-even merge sort (AFIPS 1968) without the comparisons that this element does not depend on.
     """
-    kept, needed = [], {wanted}
+    chosen, needed = [], {wanted}
     for pair in reversed(_merge_sort(count)):
         if needed & set(pair):
-            kept.append(pair)
+            chosen.append(pair)
             needed |= set(pair)
-    return tuple(reversed(kept))
+    return tuple(reversed(chosen))
 
 
 def _merge_sort(count: int) -> list[tuple[int, int]]:

@@ -153,12 +153,12 @@ def estimate_folder_correction(folder: str | Path, calibration: str | Path) -> R
 
     Raises `RecordingError` if there are no images, or they differ in size.
     """
-    pictures = natural_sorted(Path(folder).glob("*.jpg"))
-    if not pictures:
+    images = natural_sorted(Path(folder).glob("*.jpg"))
+    if not images:
         raise RecordingError(f"{folder}: no .jpg file; expected images with .mat files of the same names.")
-    pictures = [pictures[i] for i in _evenly_spaced(len(pictures), FOLDER_FRAMES)]
+    images = [images[i] for i in _evenly_spaced(len(images), FOLDER_FRAMES)]
     frames = []
-    for read, paths in ((read_colour, pictures), (read_mat_depth, [path.with_suffix(".mat") for path in pictures])):
+    for read, paths in ((read_colour, images), (read_mat_depth, [path.with_suffix(".mat") for path in images])):
         decoded = [read(path) for path in paths]
         for path, frame in zip(paths, decoded, strict=True):
             if frame.shape != decoded[0].shape:

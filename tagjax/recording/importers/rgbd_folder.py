@@ -139,7 +139,7 @@ def import_jpg_mat(
     images = natural_sorted(folder.glob("*.jpg"))
     if not images:
         raise RecordingError(f"{folder}: no .jpg file; expected images with .mat files of the same names.")
-    depths = [picture.with_suffix(".mat") for picture in images]
+    depths = [image.with_suffix(".mat") for image in images]
     absent = [depth.name for depth in depths if not depth.is_file()]
     if absent:
         raise RecordingError(
@@ -208,12 +208,12 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
     depth_s = np.array([stamp for stamp, _ in listings["depth"]])
     order = np.argsort(depth_s)
     pairs, dropped = [], 0
-    for stamp, picture in sorted(listings["rgb"]):
+    for stamp, image in sorted(listings["rgb"]):
         place = np.searchsorted(depth_s[order], stamp)
         near = order[np.clip([place - 1, place], 0, len(order) - 1)]
         best = near[np.argmin(np.abs(depth_s[near] - stamp))]
         if abs(depth_s[best] - stamp) <= max_gap_s:
-            pairs.append((stamp, picture, listings["depth"][best][1]))
+            pairs.append((stamp, image, listings["depth"][best][1]))
         else:
             dropped += 1
     if not pairs:
@@ -232,10 +232,10 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
     lens = Intrinsics(fx, fy, cx, cy, shape[1], shape[0], distortion)
 
     def colour(path: Path) -> np.ndarray:
-        picture = read_colour(path)
-        if not distortion or picture.shape != shape:  # FrameFiles refuses another shape, with the file's name
-            return picture
-        return undistort(picture, np.zeros(shape[:2], np.float32), lens)[0]
+        image = read_colour(path)
+        if not distortion or image.shape != shape:  # FrameFiles refuses another shape, with the file's name
+            return image
+        return undistort(image, np.zeros(shape[:2], np.float32), lens)[0]
 
     def depth_mm(path: Path) -> np.ndarray:
         raw = read_image(path, cv2.IMREAD_UNCHANGED)
