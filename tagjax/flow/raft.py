@@ -214,8 +214,8 @@ def look_up_products(
 class RAFTSmall(AbstractFlowNetwork):
     """The paper's small network: 990,162 parameters at 4 levels and radius 3.
 
-    `updates` corrections, each with a flow at 1/8 of the image; the last is enlarged bilinearly. `levels` and `radius` set
-    the search range: `radius` cells of 8 pixels at the finest of `levels` resolutions, twice as far at each next.
+    `updates` corrections, each with a flow at 1/8 of the image; the last is enlarged bilinearly. `levels` and `radius`
+    set the search range: `radius` cells of 8 pixels at the finest of `levels` resolutions, twice as far at each next.
     `all_pairs` keeps every product of two features in memory, 4/3 (height width / 64)^2 floats; otherwise they are
     computed at each update, for large images. Raises `ValueError` for impossible settings.
     """

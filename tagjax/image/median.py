@@ -12,7 +12,8 @@ def median_filter(image: Float[Array, "height width channel"], size: int) -> Flo
     """Median of each channel over size x size pixels; beyond the image its edge pixels are repeated.
 
     As `scipy.ndimage.median_filter(mode="nearest")`, made of minima and maxima of whole images: XLA fuses them into
-    one loop, while sorting every pixel's neighbours takes twenty times as long. The gradient goes to the median pixel. Raises `ValueError` for an even or negative size.
+    one loop, while sorting every pixel's neighbours takes twenty times as long. The gradient goes to the median pixel.
+    Raises `ValueError` for an even or negative size.
     """
     if size < 1 or size % 2 == 0:
         raise ValueError(f"size is {size}; expected an odd number of pixels.")

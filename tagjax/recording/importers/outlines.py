@@ -1,4 +1,5 @@
-"""Outlines of moving objects in depth maps and edges in colour images, which the estimate of the registration compares."""
+"""Outlines of moving objects in depth maps and edges in colour images, which the estimate of the registration
+compares."""
 
 from __future__ import annotations
 

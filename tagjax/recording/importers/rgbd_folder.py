@@ -29,7 +29,9 @@ class DepthToColour:
     translation_m: np.ndarray
 
     def corrected(self, correction: Sequence[float]) -> DepthToColour:
-        """The same cameras with a residual correction: (dTx, dTy, dTz) metres, factors on fx and fy, shifts of cx and cy in pixels."""
+        """The same cameras with a residual correction: (dTx, dTy, dTz) metres, factors on fx and fy, shifts of cx and
+        cy in pixels.
+        """
         dx, dy, dz, scale_x, scale_y, shift_x, shift_y = correction
         camera = self.colour_camera
         return dataclasses.replace(
@@ -194,11 +196,12 @@ TUM_UNITS_PER_M = 5000.0
 
 
 def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: float = 0.02) -> Recording:
-    """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each image with the depth nearest in time.
+    """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each image with the depth nearest in
+    time.
 
-    The camera follows from the folder's name if not given; lens distortion is removed frame by frame. Images without depth
-    within `max_gap_s` are left out; the recording's `source` states how many. Raises `RecordingError` for missing or
-    malformed files and an unknown camera.
+    The camera follows from the folder's name if not given; lens distortion is removed frame by frame. Images without
+    depth within `max_gap_s` are left out; the recording's `source` states how many. Raises `RecordingError` for missing
+    or malformed files and an unknown camera.
     """
     folder = Path(folder)
     listings = {kind: _tum_listing(folder / f"{kind}.txt") for kind in ("rgb", "depth")}

@@ -60,7 +60,9 @@ class TaggedRecording:
 
 
 def read_kinect(path: Path) -> Rows:
-    """The tracks of a file (id, time, x cm, z cm): seconds, x, z in metres, by id. Raises `RecordingError` for other lines."""
+    """The tracks of a file (id, time, x cm, z cm): seconds, x, z in metres, by id. Raises `RecordingError` for other
+    lines.
+    """
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for line, text in enumerate(path.read_text().splitlines(), start=1):
         try:
