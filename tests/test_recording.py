@@ -386,9 +386,9 @@ def test_a_frame_without_depth_is_carried(recording):
         ({"fx_px": 0.0}, "fx_px is 0.0; expected a positive"),
         ({"fy_px": float("nan")}, "fy_px is nan"),
         ({"cx_px": float("inf")}, "cx_px is inf; expected a finite"),
-        ({"distortion": (0.1,)}, "as many as OpenCV takes"),
+        ({"distortion": (0.1,)}, "in a number that OpenCV takes"),
         ({"distortion": (0.1, 0.0, 0.0, float("nan"))}, "expected finite k1"),
-        ({"width": 0, "height": -3}, "0 x -3; expected a picture's size"),
+        ({"width": 0, "height": -3}, "0 x -3; expected positive integers"),
     ],
 )
 def test_intrinsics_that_no_camera_has_are_errors(recording, change, message):
