@@ -1,4 +1,4 @@
-"""The configuration in a run's folder: what it was begun with is what it goes on with."""
+"""The configuration in a run folder: a run resumes only with the configuration that it was started with."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ _RETUNED = ("clip_norm", "optimizer", "joint.clip_norm", "joint.optimizer")
 
 
 def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
-    """Write `config.yaml`, where the run is new or goes on as it was configured.
+    """Write `config.yaml` if the run is new, or resumes with the same configuration.
 
-    Length, logs, scores and processes may change when a run goes on, with `retune` the optimiser's numbers as well (not its
-    kind, whose state would have another shape). Raises `ValueError`, naming what differs, where anything else does, and
-    leaves the file as it was; also where the run may not go on, which the run itself refuses.
+    A resumed run may have another length, logger, scores and processes. With `retune` it may also have other numbers of the
+    optimiser, but no other kind, because its state would have another shape. Raises `ValueError`, naming the differences,
+    where anything else differs, and leaves the file unchanged. With `resume=false` it also leaves it unchanged: the run
+    itself then refuses to start over a checkpoint.
     """
     path = folder / "config.yaml"
     if checkpoint_steps(folder) and path.is_file():
@@ -39,8 +40,8 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
         differ = _differences(before, dict(values), retune=bool(values.get("retune", False)))
         if differ:
             raise ValueError(
-                f"{folder} holds a run that was configured otherwise: {'; '.join(differ)}. Give the same settings to go on "
-                "with it (retune=true lets clip_norm and numbers of the optimiser change), or another folder."
+                f"{folder} holds a run with another configuration: {'; '.join(differ)}. Give the same settings to resume it "
+                "(retune=true allows another clip_norm and other numbers of the optimiser), or another folder."
             )
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     OmegaConf.save(OmegaConf.create(dict(values)), beside)
@@ -48,7 +49,7 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
-    """The steps after which a run has checkpoints, without a look into them."""
+    """The steps of a run's checkpoints, by the names of their folders."""
     return [int(path.name) for path in (folder / "checkpoints").glob("*") if path.name.isdigit()]
 
 
@@ -65,4 +66,4 @@ def _differences(before: Any, now: Any, where: str = "", *, retune: bool) -> lis
             for name in names
             for text in _differences(before.get(name), now.get(name), f"{where}.{name}".lstrip("."), retune=retune)
         ]
-    return [] if before == now else [f"{where} was {before!r} and is {now!r}"]
+    return [] if before == now else [f"{where} was {before!r} and is now {now!r}"]

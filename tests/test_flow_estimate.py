@@ -27,7 +27,7 @@ import tagjax.flow
 import tagjax.flow.estimates
 import tagjax.flow.weights
 from tagjax.core.array_file import named_arrays
-from tagjax.core.settings import build
+from tagjax.core.build import build
 from tagjax.flow.cache import pair_flow
 from tagjax.flow.estimates import NetworkFlow, consistency, estimate, flow_along, forward_flow, padding
 from tagjax.flow.images import check_images, to_uint8

@@ -1152,7 +1152,7 @@ def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
     assert told[_beyond_the_line(straight((4.6, 0.3), (-1.6, 0.3)))].all()
     for frame, trace in said:
         best = int(np.argmax(probability[leaver, frame]))
-        assert bool(trace.found[leaver]) == (best > 0)
+        assert bool(trace.detected[leaver]) == (best > 0)
         if best:
             np.testing.assert_allclose(trace.confidence[leaver], probability[leaver, frame, best], atol=1e-4)
             truth = np.asarray(shop.truth.labels[frame]) == 1
@@ -1162,7 +1162,7 @@ def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
             assert place[2] == pytest.approx(0.85, abs=0.01)
     assert len(overlap) == told.sum()
     assert np.mean(overlap[3:-10]) > 0.7
-    assert not any(trace.found[seen.epcs.index("shelf")] for _, trace in said[10:])
+    assert not any(trace.detected[seen.epcs.index("shelf")] for _, trace in said[10:])
 
 
 def test_a_tracer_without_commissioning_learns_the_background_itself(calibration):
@@ -1171,7 +1171,7 @@ def test_a_tracer_without_commissioning_learns_the_background_itself(calibration
     recording = drawn_shop({"a": walk}, {})
     settings = dataclasses.replace(LOOKING_DOWN, blobs=dataclasses.replace(LOOKING_DOWN.blobs, warm_up="online"))
     tracer = GollerTracer(calibration, settings, site=find_site(recording))
-    assert sum(bool(trace.found[0]) for _, trace in host_trace(tracer, recording)) > 15
+    assert sum(bool(trace.detected[0]) for _, trace in host_trace(tracer, recording)) > 15
 
 
 def test_a_state_is_stepped_once_and_depth_is_refused(shop, calibration):
@@ -1207,7 +1207,8 @@ def test_recordings_that_it_cannot_do_are_named(shop, calibration):
 
 def test_the_configuration_names_every_setting():
     with initialize_config_dir(str(Path(__file__).parents[1].resolve() / "conf"), version_base="1.3"):
-        values: Any = OmegaConf.to_container(compose("goller"))
+        values: Any = OmegaConf.to_container(compose("goller"), resolve=True)
+    values.pop("paths")
     config = from_mapping(GollerConfig, values)
     assert config.settings == GollerSettings()
     names = lambda kind: {field.name for field in dataclasses.fields(kind)}  # noqa: E731
@@ -1224,14 +1225,14 @@ def test_all_that_is_missing_is_named_before_anything_is_observed(tmp_path):
 
     grid, shop = tmp_path / "grid.zarr", tmp_path / "shop_exit"
     config = GollerConfig(grid=str(grid), scenarios=str(shop), handover=str(tmp_path / "nowhere"))
-    with pytest.raises(ValueError, match=r"benchmark=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
+    with pytest.raises(ValueError, match=r"suite=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
         run_goller(config, opened, tmp_path)
     grid.mkdir()
     for split in ("train", "validation", "test"):
         with pytest.raises(ValueError, match=rf"shop_exit: no recording in .*{split}/"):
             run_goller(dataclasses.replace(config, handover=None), opened, tmp_path)
         (shop / split / f"shop_exit-sp_st-{split}-0.zarr").mkdir(parents=True)
-    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate benchmark=shop_handover`"):
+    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate suite=shop_handover`"):
         run_goller(config, opened, tmp_path)
     # Where none is named those beside the scenarios are taken, if there are any.
     default = dataclasses.replace(config, handover=None)

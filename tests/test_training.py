@@ -121,8 +121,8 @@ def test_likelihood_tells_tags_apart_whatever_is_flipped() -> None:
     own, own_clean = (np.einsum("iip->ip", np.asarray(one.between)) for one in (found, clean))
     # A flip costs about log(0.95 / 0.05) nats, not the read's whole weight.
     assert (own > 0.5 * own_clean).all()
-    with pytest.raises(ValueError, match="flip_share is 0"):
-        ObjectiveSettings(flip_share=0.0)
+    with pytest.raises(ValueError, match="flip_probability is 0"):
+        ObjectiveSettings(flip_probability=0.0)
 
 
 def test_reads_of_a_resting_tag_have_no_say() -> None:

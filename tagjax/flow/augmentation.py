@@ -22,7 +22,7 @@ class AugmentationSettings:
     margin_px: int = 0  # at each side of the crop, for the loss only (SMURF's full-image warping)
     scale: tuple[float, float] = (0.7, 1.4)  # log-uniform; an image that is too small is enlarged to fit
     rotation_deg: float = 10.0  # uniform, up to this much either way
-    gaps: tuple[int, ...] = (1, 2)  # frames between the images of a pair
+    gaps: tuple[int, ...] = (1, 2, 4)  # frames between the images of a pair
     gain: float = 0.25  # of both images, relative
     gamma: float = 0.25  # of both images, logarithm of the exponent
     tint: float = 0.1  # gain of each colour channel, relative

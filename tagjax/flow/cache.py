@@ -91,7 +91,7 @@ def _true_flow(recording: Recording, first: int, last: int) -> tuple[np.ndarray,
     if forward is None or backward is None:
         raise RecordingError(
             f"{recording.name}: flow=truth, but the recording has no true flow forward and backward. Simulate it with "
-            "`capture: {flow: true}`, as conf/benchmark/corpus.yaml does, or name a flow that is computed (dis)."
+            "`capture: {flow: true}`, as conf/suite/corpus.yaml does, or name a flow that is computed (dis)."
         )
     return _with_first_frame(
         recording,

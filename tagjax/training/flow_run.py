@@ -15,8 +15,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from ..core.build import build
 from ..core.machine import machine
-from ..core.settings import build
 from ..flow.augmentation import AugmentationSettings
 from ..flow.estimates import NetworkFlow, forward_flow
 from ..flow.image_sequences import open_sequence
