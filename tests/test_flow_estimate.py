@@ -317,7 +317,7 @@ def test_a_video_is_encoded_once_and_flows_both_ways(monkeypatch):
     np.testing.assert_array_equal(there, dis(*pictures[:2]))
     np.testing.assert_array_equal(back, dis(pictures[1], pictures[0]))
     assert list(flow_along(flow, pictures[:1])) == list(flow_along(dis, [])) == []
-    with pytest.raises(ValueError, match="a flow needs one size"):
+    with pytest.raises(ValueError, match="a flow needs equal sizes"):
         list(flow_along(flow, [pictures[0], pictures[1][:50]]))
 
 

@@ -143,8 +143,8 @@ def test_damaged_flo_files_are_refused(tmp_path):
         (b"PNG!" + good[4:], "does not begin with"),
         (good[:-1], "holds 203 bytes; 6 x 4 pixels need 204"),
         (good + b"0", "holds 205 bytes"),
-        (good[:4] + struct.pack("<ii", -6, 4) + good[12:], "says -6 x 4 pixels"),
-        (good[:4] + struct.pack("<ii", 6, 10**6) + good[12:], "says 6 x 1000000 pixels"),
+        (good[:4] + struct.pack("<ii", -6, 4) + good[12:], "states -6 x 4 pixels"),
+        (good[:4] + struct.pack("<ii", 6, 10**6) + good[12:], "states 6 x 1000000 pixels"),
     ):
         path.write_bytes(content)
         with pytest.raises(RecordingError, match=message):

@@ -99,7 +99,7 @@ def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
     path, told = str(tmp_path), ""
     if broken == "one":
         (tmp_path / "b.png").unlink()
-        told = "holds 1 pictures"
+        told = "holds 1 images"
     elif broken == "sizes":
         cv2.imwrite(str(tmp_path / "b.png"), pictures[1][:30])
         told = "50 x 30 pixels"
@@ -349,7 +349,7 @@ def test_impossible_cuts_are_refused() -> None:
     pictures = np.zeros((3, 40, 48, 3), np.uint8)
     with pytest.raises(RecordingError, match="48 x 40 pixels; cuts for a student take 64 x 32"):
         cut_pairs(pictures, 2, (32, 64), (1,), seed=0)
-    with pytest.raises(RecordingError, match="No two of 3 images are 4 frames apart"):
+    with pytest.raises(RecordingError, match="No two of 3 pictures are 4 frames apart"):
         cut_pairs(pictures, 2, (32, 32), (4,), seed=0)
 
 

@@ -223,7 +223,7 @@ def test_numpy_values_in_attributes_are_made_plain(recording, tmp_path):
     ("part", "change", "message"),
     [
         ("truth", {"tag_to_label": {"tag-a": {1, 2}}}, r"truth\['tag_to_label'\]\['tag-a'\] holds \{1, 2\} \(set\)"),
-        ("truth", {"tag_to_label": {3: 1}}, "the key 3; expected names"),
+        ("truth", {"tag_to_label": {3: 1}}, "the key 3; expected strings"),
         ("truth", {"visible": {1: np.array(["yes"])}}, "truth/visible/0 holds <U3"),
         ("clock", {"offset_s": 1j}, r"clock\['offset_s'\] holds 1j"),
         ("reads", {"antenna": np.array([None])}, "reads/antenna holds object"),
@@ -386,9 +386,9 @@ def test_a_frame_without_depth_is_carried(recording):
         ({"fx_px": 0.0}, "fx_px is 0.0; expected a positive"),
         ({"fy_px": float("nan")}, "fy_px is nan"),
         ({"cx_px": float("inf")}, "cx_px is inf; expected a finite"),
-        ({"distortion": (0.1,)}, "as many as OpenCV takes"),
+        ({"distortion": (0.1,)}, "in a number that OpenCV takes"),
         ({"distortion": (0.1, 0.0, 0.0, float("nan"))}, "expected finite k1"),
-        ({"width": 0, "height": -3}, "0 x -3; expected a picture's size"),
+        ({"width": 0, "height": -3}, "0 x -3; expected positive integers"),
     ],
 )
 def test_intrinsics_that_no_camera_has_are_errors(recording, change, message):

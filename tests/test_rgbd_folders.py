@@ -116,10 +116,10 @@ def test_a_shifted_depth_camera_moves_the_depth_by_its_parallax(folder, unit):
 
 
 def test_incomplete_folders_are_errors(folder, importing, tmp_path):
-    with pytest.raises(RecordingError, match="0 masks for 4 pictures"):
+    with pytest.raises(RecordingError, match="0 masks for 4 images"):
         importing(masks=tmp_path)
     (folder / "masks" / "002.png").unlink()
-    with pytest.raises(RecordingError, match="3 masks for 4 pictures"):
+    with pytest.raises(RecordingError, match="3 masks for 4 images"):
         importing(masks=folder / "masks")
     with pytest.raises(RecordingError, match="positive frame rate"):
         importing(fps=0.0)
@@ -240,7 +240,7 @@ def test_depth_or_pictures_of_another_size_are_errors(folder, importing):
     recording = importing()
     with pytest.raises(RecordingError, match=r"image001\.mat: depth of shape \(10, 12\); expected \(48, 64\)"):
         recording.depth[1]
-    with pytest.raises(RecordingError, match=r"image003\.jpg: a picture of shape \(20, 30, 3\)"):
+    with pytest.raises(RecordingError, match=r"image003\.jpg: an image of shape \(20, 30, 3\)"):
         recording.colour[3]
 
 
@@ -293,7 +293,7 @@ def test_tum_pairs_pictures_with_the_nearest_depth(tmp_path):
     assert recording.intrinsics == Intrinsics(535.4, 539.2, 320.1, 247.6, 640, 480)
     assert import_tum(folder, max_gap_s=0.003).num_frames == 1
     assert import_tum(folder, max_gap_s=0.2).num_frames == 4
-    with pytest.raises(RecordingError, match="no picture has a depth map within"):
+    with pytest.raises(RecordingError, match="no image has a depth map within"):
         import_tum(folder, max_gap_s=0.0005)
 
 
@@ -340,13 +340,13 @@ def test_tum_folders_that_cannot_be_used_are_errors(tmp_path):
     with pytest.raises(RecordingError, match=r"2\.000\.png: uint8 of shape"):
         import_tum(folder).depth[1]
     cv2.imwrite(str(folder / "rgb" / "1.000.png"), np.zeros((240, 320, 3), np.uint8))
-    with pytest.raises(RecordingError, match=r"a picture of \(240, 320\); expected \(480, 640\)"):
+    with pytest.raises(RecordingError, match=r"an image of \(240, 320\); expected \(480, 640\)"):
         import_tum(folder)
     (folder / "depth" / "2.000.png").unlink()
     with pytest.raises(RecordingError, match=r"1 listed files are missing, first .*depth/2\.000\.png"):
         import_tum(folder)
     (folder / "rgb.txt").write_text("# none\n")
-    with pytest.raises(RecordingError, match="lists no picture"):
+    with pytest.raises(RecordingError, match="lists no image"):
         import_tum(folder)
     (folder / "rgb.txt").write_text("1.0\n")
     with pytest.raises(RecordingError, match=r"rgb\.txt, line 1"):

@@ -1,4 +1,4 @@
-"""PyTrees of arrays in safetensors files, with JSON metadata that says what the arrays are and how they were made.
+"""PyTrees of arrays in safetensors files, with JSON metadata about the arrays and their origin.
 
 Nothing in a file is executed. Names, shapes and dtypes are compared with the expected tree before any value is read.
 """
@@ -43,8 +43,8 @@ class ArrayFile:
     def write(self, path: str | Path, tree: Any, metadata: Mapping[str, Any], *, half: bool = False) -> None:
         """Write the arrays of a tree by name (`named_arrays`) as float32, or as float16 if `half`.
 
-        `metadata` is stored as JSON. The same content gives the same bytes; the file appears whole or not at all. Raises
-        `ValueError` for values that are not finite and for metadata that JSON does not have.
+        `metadata` is stored as JSON. The same content gives the same bytes; the file appears whole or not at all.
+        Raises `ValueError` for values that are not finite and for metadata that JSON does not have.
         """
         dtype = np.float16 if half else np.float32
         arrays = {name: np.ascontiguousarray(leaf, dtype) for name, leaf in named_arrays(tree).items()}

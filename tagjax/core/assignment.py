@@ -12,8 +12,8 @@ def hard_assignment(
 ) -> Integer[np.ndarray, " rows"]:
     """The column of each row in the one-to-one assignment of highest total score; -1 for an unassigned row.
 
-    Computed on the host by SciPy's `linear_sum_assignment`. A pair of score -inf is forbidden. With `unmatched_score` the
-    sum of (score - unmatched_score) over the assigned pairs is maximised, so that a pair of a lower score stays
+    Computed on the host by SciPy's `linear_sum_assignment`. A pair of score -inf is forbidden. With `unmatched_score`
+    the sum of (score - unmatched_score) over the assigned pairs is maximised, so that a pair of a lower score stays
     unassigned; without it the number of pairs is maximised first. Raises `ValueError` for NaN and +inf.
     """
     score = np.asarray(score, np.float64)

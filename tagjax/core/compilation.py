@@ -18,9 +18,9 @@ def large_program(
 ) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
     """`eqx.filter_jit` for programs of thousands of operations; not for use within another transformation.
 
-    On CPUs it uses XLA's older emitters: a training step of the tracer compiles in two thirds of the time and half of the
-    memory, and runs as fast. `level` is XLA's optimisation level, 3 by default; at 1 compilation is faster still, and
-    operations other than convolutions and matrix products are slower.
+    On CPUs it uses XLA's older emitters: a training step of the tracer compiles in two thirds of the time and half of
+    the memory, and runs as fast. `level` is XLA's optimisation level, 3 by default; at 1 compilation is faster still,
+    and operations other than convolutions and matrix products are slower.
     """
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -100,7 +100,9 @@ def undistorted_positions(intrinsics: Intrinsics) -> Float[np.ndarray, "height w
 def undistort(
     colour: UInt8[np.ndarray, "height width 3"], depth_m: Float[np.ndarray, "height width"], intrinsics: Intrinsics
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "height width"], Intrinsics]:
-    """Colour (bilinear) and depth (nearest neighbour: depth must not be averaged) without lens distortion; black and 0 outside."""
+    """Colour (bilinear) and depth (nearest neighbour: depth must not be averaged) without lens distortion; black and 0
+    outside.
+    """
     positions = undistorted_positions(intrinsics)
     where = [positions[..., 1], positions[..., 0]]
     # With integer output SciPy truncates, which darkens the image by half a level.

@@ -1,7 +1,7 @@
 """Learnable parameters by name: stored unconstrained, read and set in physical units.
 
-A leaf whose name starts with `log_` holds the logarithm of a positive value, one with `logit_` the log odds of a fraction
-from 0 to 1; any other holds the value itself.
+A leaf whose name starts with `log_` holds the logarithm of a positive value, one with `logit_` the log odds of a
+fraction from 0 to 1; any other holds the value itself.
 """
 
 from __future__ import annotations

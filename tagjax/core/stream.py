@@ -22,7 +22,9 @@ _GRACE_PERIOD_S = 60.0
 
 @dataclasses.dataclass(frozen=True)
 class Stream:
-    """An endless dataset and how it is read; `iter` returns a `StreamIterator`. Raises `ValueError` for negative workers."""
+    """An endless dataset and how it is read; `iter` returns a `StreamIterator`. Raises `ValueError` for negative
+    workers.
+    """
 
     dataset: grain.MapDataset  # endless: a sample depends on its position alone
     workers: int = 0  # processes that prefetch; with 0 a thread of this process does

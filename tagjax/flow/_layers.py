@@ -59,8 +59,8 @@ class Conv(eqx.Module):
 class SeparableConv(eqx.Module):
     """A depthwise separable convolution, 3 x 3 then 1 x 1 (Xception, Chollet, CVPR 2017), with bias.
 
-    On CPUs the depthwise part is nine additions of shifted images and the other a matrix product, which uses every core:
-    with 32 channels a third of the time of `Conv`, with 64 an eighth.
+    On CPUs the depthwise part is nine additions of shifted images and the other a matrix product, which uses every
+    core: with 32 channels a third of the time of `Conv`, with 64 an eighth.
     """
 
     depth: Float[Array, "3 3 inputs"]

@@ -54,11 +54,12 @@ def augment(
     settings: AugmentationSettings,
     flow_px: Float32[np.ndarray, "_ _ 2"] | None = None,
 ) -> dict[str, np.ndarray]:
-    """A random crop of a pair, uint8: `clean`, for the loss, and `augmented`, for the network, with other light and noise.
+    """A random crop of a pair, uint8: `clean`, for the loss, and `augmented`, for the network, with other light and
+    noise.
 
-    `clean` extends `margin_px` further than `augmented` at each side. With the pair's flow, first to second in pixels, the
-    result holds the flow between the cropped images, `flow_px`, NaN where the crop extends beyond the image; without it
-    the order of the two images is random.
+    `clean` extends `margin_px` further than `augmented` at each side. With the pair's flow, first to second in pixels,
+    the result holds the flow between the cropped images, `flow_px`, NaN where the crop extends beyond the image;
+    without it the order of the two images is random.
     """
     margin = settings.margin_px
     size = settings.height + 2 * margin, settings.width + 2 * margin
@@ -93,7 +94,9 @@ def _change_light(
 def _crop_geometry(
     image_shape: tuple[int, ...], rng: np.random.Generator, settings: AugmentationSettings, size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "2 3"], float]:
-    """The affine map from pixels (x, y, 1) of a random crop of (rows, columns) `size` to the image's pixels; and its scale."""
+    """The affine map from pixels (x, y, 1) of a random crop of (rows, columns) `size` to the image's pixels; and its
+    scale.
+    """
     (height, width), (rows, columns) = image_shape, size
     low, high = settings.scale
     scale = np.exp(rng.uniform(np.log(low), np.log(high)))

@@ -1,4 +1,4 @@
-"""Optical flow between neighbouring frames, computed once and kept with the recording."""
+"""Optical flow between consecutive frames, computed once and stored in the recording's folder."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ TRUTH = "truth"
 def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Flow between frames t - 1 and t for t = first .. last - 1: (forward on t - 1, backward on t).
 
-    Both float32 (frames, height, width, 2), pixels of the full image; zero for frame 0, which has no frame before it, and
-    where the images agree as well without motion (`zero_stationary`). `method` is a name that `make_flow` takes, or
+    Both float32 (frames, height, width, 2), pixels of the full image; zero for frame 0, which has no frame before it,
+    and where the images agree as well without motion (`zero_stationary`). `method` is a name that `make_flow` takes, or
     `truth`: the exact flow that a recording was simulated with, zero where it is not known. The first call computes the
-    flow of the whole recording and stores it as float16 in the recording's folder, under `cache/flow/<key>/` (`flow_key`:
-    other weights of a network have another key), if the folder is writable; otherwise only the frames asked for are
-    computed. Raises `ValueError` for frames outside the recording and unknown names, `RecordingError` for `truth` of a
-    recording without true flow.
+    flow of the whole recording and stores it as float16 in the recording's folder, under `cache/flow/<key>/`
+    (`flow_key`: other weights of a network have another key), if the folder is writable; otherwise only the requested
+    frames are computed. Raises `ValueError` for frames outside the recording and unknown names, `RecordingError` for
+    `truth` of a recording without true flow.
     """
     if first < 0 or last > recording.num_frames or first >= last:
         raise ValueError(

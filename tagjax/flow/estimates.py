@@ -35,7 +35,9 @@ _compiled: set[Any] = set()
 
 
 class FlowEstimate(eqx.Module):
-    """Forward and backward flow (pixels), each on its own image's pixels, occlusion masks and confidence (`consistency`)."""
+    """Forward and backward flow (pixels), each on its own image's pixels, occlusion masks and confidence
+    (`consistency`).
+    """
 
     forward_px: Float[Array, "height width 2"]
     backward_px: Float[Array, "height width 2"]
@@ -57,8 +59,8 @@ def consistency(
     """Forward-backward consistency, 0 to 1: t / (t + |f + b|^2), t = 0.01 (|f|^2 + |b|^2) + 0.5 pixels^2.
 
     b is the backward flow at x + f. The value is 1 where the two flows cancel, 1/2 at the threshold of Sundaram et al.
-    (ECCV 2010) for an occluded pixel, and 0 where the target is more than half a pixel outside the image, or outside its
-    part `area` (x0 y0 x1 y1, inclusive).
+    (ECCV 2010) for an occluded pixel, and 0 where the target is more than half a pixel outside the image, or outside
+    its part `area` (x0 y0 x1 y1, inclusive).
     """
     height, width, _ = flow_px.shape
     if area is None:
@@ -133,8 +135,8 @@ def _apply_twice(
 ) -> tuple[Any, Any]:
     """`function` of the network and of each of two tuples of arguments.
 
-    On CPUs in two threads, since XLA runs a network's convolutions on one core. The first call is sequential, so that it
-    compiles once.
+    On CPUs in two threads, since XLA runs a network's convolutions on one core. The first call is sequential, so that
+    it compiles once.
     """
     parts = jax.tree.leaves((network, one, other))
     key = (function, jax.tree.structure(network), tuple((jnp.shape(part), jnp.result_type(part)) for part in parts))
@@ -163,9 +165,9 @@ def _checked(first: Any, second: Any) -> tuple[Any, Any]:
 def estimate(flow: AbstractFlowNetwork | HostFlow, first: Any, second: Any) -> FlowEstimate:
     """Forward and backward flow between two images with occlusion and confidence; zero between equal images.
 
-    `flow` is a network, or a flow of `make_flow`, which is called once for each direction. Images and errors are those of
-    `check_images`; for a network within a transformation of JAX, floats (height, width, 3) from 0 to 1. Sides that are
-    too short, or no multiple of the network's divisor, are padded by the edge pixels, and the flow is cropped.
+    `flow` is a network, or a flow of `make_flow`, which is called once for each direction. Images and errors are those
+    of `check_images`; for a network within a transformation of JAX, floats (height, width, 3) from 0 to 1. Sides that
+    are too short, or no multiple of the network's divisor, are padded by the edge pixels, and the flow is cropped.
     """
     network = flow.network if isinstance(flow, NetworkFlow) else flow
     one, other = _checked(first, second)

@@ -29,7 +29,9 @@ def read_flo(path: str | Path) -> Float[np.ndarray, "height width 2"]:
             raise RecordingError(f"{path} does not begin with {_MAGIC} (PIEH); expected a .flo file.")
         width, height = (int(side) for side in np.frombuffer(head[4:], "<i4"))
         if not (1 <= width <= _MAX_SIDE_PX and 1 <= height <= _MAX_SIDE_PX):
-            raise RecordingError(f"{path} says {width} x {height} pixels; expected 1 to {_MAX_SIDE_PX}. It is damaged.")
+            raise RecordingError(
+                f"{path} states {width} x {height} pixels; expected 1 to {_MAX_SIDE_PX}. Copy it again."
+            )
         expected = 12 + 8 * width * height
         if size != expected:
             raise RecordingError(

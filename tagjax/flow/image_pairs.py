@@ -16,7 +16,9 @@ from .augmentation import AugmentationSettings, augment
 
 
 class PairSource:
-    """All pairs of images of a sequence whose distance is one of `gaps` frames. Raises `RecordingError` if there is none."""
+    """All pairs of images of a sequence whose distance is one of `gaps` frames. Raises `RecordingError` if there is
+    none.
+    """
 
     def __init__(self, sequence: LazyArray, gaps: Sequence[int]):
         count = sequence.shape[0]
@@ -49,7 +51,9 @@ class StackedPairs:
 
 
 class TeacherPairs:
-    """Stored pairs, (pair, 2, height, width, 3), with a teacher's flow from first to second, (pair, height, width, 2) in pixels."""
+    """Stored pairs, (pair, 2, height, width, 3), with a teacher's flow from first to second, (pair, height, width, 2)
+    in pixels.
+    """
 
     def __init__(self, pairs: LazyArray, flow_px: LazyArray):
         if tuple(flow_px.shape) != (pairs.shape[0], *pairs.shape[2:4], 2):
@@ -88,8 +92,8 @@ def pair_dataset(
 ) -> Stream:
     """An endless, shuffled stream of augmented pairs (`augment`); its iterator resumes exactly.
 
-    Sources are mixed in proportion to `weights`. `workers` processes read them; `shard` (i, n) is every n-th pair of the
-    stream, from the i-th on. Raises `ValueError` unless there is a positive weight for each source.
+    Sources are mixed in proportion to `weights`. `workers` processes read them; `shard` (i, n) is every n-th pair of
+    the stream, from the i-th on. Raises `ValueError` unless there is a positive weight for each source.
     """
     if len(sources) != len(weights) or not sources or min(weights) <= 0:
         raise ValueError(f"{len(sources)} sources with weights {list(weights)}; expected a positive weight for each.")

@@ -15,8 +15,8 @@ def check_images(
 ) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width 3"]]:
     """Both images as RGB of one size and dtype: uint8 if both are, else float32 from 0 to 1.
 
-    Grey becomes RGB, an alpha channel is removed, uint16 is divided by 65535. Raises `ValueError` for anything that is no
-    image, for floats that are not finite or outside 0 to 1, and for two sizes.
+    Grey becomes RGB, an alpha channel is removed, uint16 is divided by 65535. Raises `ValueError` for anything that is
+    no image, for floats that are not finite or outside 0 to 1, and for two sizes.
     """
     if first is None or second is None:
         raise ValueError("One image is missing; a flow needs two of the same size.")

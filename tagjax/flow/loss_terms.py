@@ -34,7 +34,9 @@ def inside(flow_px: Float[Array, "height width 2"], margin_px: int = 0) -> Bool[
 
 
 def crop_margin_px(crop: tuple[int, ...], whole: tuple[int, ...]) -> int:
-    """Pixels by which an image extends beyond a central crop at every side, from the two shapes. Raises `ValueError` otherwise."""
+    """Pixels by which an image extends beyond a central crop at every side, from the two shapes. Raises `ValueError`
+    otherwise.
+    """
     margin = (whole[0] - crop[0]) // 2
     if margin < 0 or whole[:2] != (crop[0] + 2 * margin, crop[1] + 2 * margin):
         raise ValueError(
@@ -86,7 +88,8 @@ def smoothness(
 ) -> Float[Array, ""]:
     """Mean over both axes of exp(-w |dI|) sqrt(|d^n f|^2 + 0.001^2), n = `order` 1 or 2 (UFlow, Eq. 5).
 
-    dI is the mean over colours of the difference between the first and the last of the n + 1 pixels of the flow's difference.
+    dI is the mean over colours of the difference between the first and the last of the n + 1 pixels of the flow's
+    difference.
     """
     total = jnp.zeros(())
     for axis in (0, 1):
@@ -105,7 +108,8 @@ def self_supervision_term(
     teacher_occluded: Bool[Array, "height width"],
     border_px: int,
 ) -> Float[Array, ""]:
-    """Error of a student on cropped images against a teacher on whole ones, where only the student is occluded (UFlow, Eq. 6).
+    """Error of a student on cropped images against a teacher on whole ones, where only the student is occluded (UFlow,
+    Eq. 6).
 
     The student's image is the teacher's without `border_px` at each side. The teacher gets no gradient.
     """

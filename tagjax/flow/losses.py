@@ -102,7 +102,8 @@ def visible_mask(
     settings: FlowLossSettings,
     margin_px: int = 0,
 ) -> Float[Array, "height width"]:
-    """1 where a pixel is visible in the second image, 0 where it left the image, 1 - `occlusion_weight` where it is occluded.
+    """1 where a pixel is visible in the second image, 0 where it left the image, 1 - `occlusion_weight` where it is
+    occluded.
 
     A pixel that leaves the crop for the margin around it has no backward flow to compare with, and counts as visible.
     """
@@ -123,7 +124,8 @@ def level_terms(
     occlusion_weight: Float[Array, ""],
     settings: FlowLossSettings,
 ) -> dict[str, Float[Array, ""]]:
-    """Data term and smoothness of one direction, summed over levels; with `occlusion_weight` 1 occluded pixels are left out.
+    """Data term and smoothness of one direction, summed over levels; with `occlusion_weight` 1 occluded pixels are left
+    out.
 
     `second` may extend beyond `first` (`data_term`) by a multiple of the coarsest level's stride. Smoothness applies to
     the last level before the learned upsampling, which follows the image's edges by itself. Raises `ValueError` for a
@@ -166,8 +168,8 @@ def sequence_terms(
     """`level_terms` of a recurrent network: sum over its updates i of decay^(last - i) times the terms (SMURF, Eq. 1).
 
     The estimates before the last have one size, and each is enlarged to the image size; the last estimate is the last
-    update enlarged by the network itself, and adds nothing. Occlusion follows from the last update. Smoothness applies to
-    each update at its own size. Raises `ValueError` for estimates of several sizes.
+    update enlarged by the network itself, and adds nothing. Occlusion follows from the last update. Smoothness applies
+    to each update at its own size. Raises `ValueError` for estimates of several sizes.
     """
     if len({flow.shape for flow in forward[:-1]}) != 1:
         raise ValueError(
@@ -208,8 +210,8 @@ def distillation_term(
 ) -> Float[Array, ""]:
     """Robust end-point error of all estimates of a student against a teacher's flow, weighted by level.
 
-    Errors are in pixels of the image at every level, against the mean of the teacher's flow over each pixel of the level.
-    Pixels at which the teacher's flow is NaN are left out. The teacher gets no gradient.
+    Errors are in pixels of the image at every level, against the mean of the teacher's flow over each pixel of the
+    level. Pixels at which the teacher's flow is NaN are left out. The teacher gets no gradient.
     """
     height = teacher_px.shape[0]
     known = jnp.all(jnp.isfinite(teacher_px), axis=-1, keepdims=True).astype(teacher_px.dtype)

@@ -67,8 +67,8 @@ def to_grey_uint8(colour: np.ndarray) -> np.ndarray:
 
 def _grey_pair(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Both images, checked, in grey, padded to the minimum side."""
-    one, other = (to_grey_uint8(np.ascontiguousarray(to_uint8(picture))) for picture in check_images(first, second))
+    one, other = (to_grey_uint8(np.ascontiguousarray(to_uint8(image))) for image in check_images(first, second))
     rows, columns = (max(0, _MIN_SIDE_PX - size) for size in one.shape)
     if rows or columns:
-        one, other = (np.pad(picture, ((0, rows), (0, columns)), mode="edge") for picture in (one, other))
+        one, other = (np.pad(image, ((0, rows), (0, columns)), mode="edge") for image in (one, other))
     return one, other

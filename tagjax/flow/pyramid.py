@@ -76,15 +76,15 @@ class PyramidFlow(AbstractFlowNetwork):
     `iterations` the numbers of corrections with the same weights, each around the last flow (None: two, but one at the
     finest and the coarsest level); `decoder_widths` the hidden layers (a last one of 32 is added).
 
-    `octaves` are the scales of the image, as powers of two, at which the same weights are applied in turn, each from the
-    flow of the one before: all levels at the smallest scale, the finest two up to scale 0, the finest only above. -1
-    doubles the search range; each octave above 0 doubles the resolution and takes four times as long.
+    `octaves` are the scales of the image, as powers of two, at which the same weights are applied in turn, each from
+    the flow of the one before: all levels at the smallest scale, the finest two up to scale 0, the finest only above.
+    -1 doubles the search range; each octave above 0 doubles the resolution and takes four times as long.
 
     `separable` uses `SeparableConv` for every 3 x 3 convolution: a third to an eighth of the time. `matched` are the
     numbers of features of each level that the costs are computed from, projected from all; 0 or None: all features.
 
-    `medians` is the number of final 5 x 5 median filters of the flow (Sun et al., CVPR 2010). Filters between the octaves
-    would improve large motion, but lose objects of a few pixels. Raises `ValueError` for impossible settings.
+    `medians` is the number of final 5 x 5 median filters of the flow (Sun et al., CVPR 2010). Filters between the
+    octaves would improve large motion, but lose objects of a few pixels. Raises `ValueError` for impossible settings.
     """
 
     encoders: tuple[tuple[_Layer, _Layer], ...]

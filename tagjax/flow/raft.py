@@ -114,15 +114,15 @@ class _Update(eqx.Module):
         relu = jax.nn.relu
         moving = relu(self.flow_refine(relu(self.flow_enter(flow_px))))
         motion = relu(self.motion(jnp.concatenate([relu(self.cost(costs)), moving], axis=-1)))
-        seen = jnp.concatenate([context, motion, flow_px], axis=-1)
-        update, reset = jnp.split(jax.nn.sigmoid(self.gates(jnp.concatenate([hidden, seen], axis=-1))), 2, axis=-1)
-        candidate = jnp.tanh(self.candidate(jnp.concatenate([reset * hidden, seen], axis=-1)))
+        inputs = jnp.concatenate([context, motion, flow_px], axis=-1)
+        update, reset = jnp.split(jax.nn.sigmoid(self.gates(jnp.concatenate([hidden, inputs], axis=-1))), 2, axis=-1)
+        candidate = jnp.tanh(self.candidate(jnp.concatenate([reset * hidden, inputs], axis=-1)))
         hidden = (1 - update) * hidden + update * candidate
         return hidden, self.head(relu(self.head_enter(hidden)))
 
 
 def halve(features: Float[Array, "height width channel"]) -> Float[Array, "rows columns channel"]:
-    """Mean of every two by two; an odd last row or column is left out; a side of one is kept."""
+    """Mean of every two by two; an odd last row or column is left out; a side of one is residuals."""
     height, width, channels = features.shape
     tall, wide = min(2, height), min(2, width)
     rows, columns = height // tall, width // wide
@@ -158,8 +158,8 @@ def _look_up_forward(volume: Array, x: Array, y: Array, radius: int) -> tuple[Ar
     return _look_up(volume, x, y, radius), (x, y, volume.shape)
 
 
-def _look_up_backward(radius: int, kept: Any, cotangent: Array) -> tuple[Array, Array, Array]:
-    x, y, (_, rows, columns) = kept
+def _look_up_backward(radius: int, residuals: Any, cotangent: Array) -> tuple[Array, Array, Array]:
+    x, y, (_, rows, columns) = residuals
     along = jnp.einsum("nyx,nxw->nyw", cotangent, _hats(x, radius, columns))
     return jnp.einsum("nyw,nyh->nhw", along, _hats(y, radius, rows)), jnp.zeros_like(x), jnp.zeros_like(y)
 
@@ -214,8 +214,8 @@ def look_up_products(
 class RAFTSmall(AbstractFlowNetwork):
     """The paper's small network: 990,162 parameters at 4 levels and radius 3.
 
-    `updates` corrections, each with a flow at 1/8 of the image; the last is enlarged bilinearly. `levels` and `radius` set
-    the search range: `radius` cells of 8 pixels at the finest of `levels` resolutions, twice as far at each next.
+    `updates` corrections, each with a flow at 1/8 of the image; the last is enlarged bilinearly. `levels` and `radius`
+    set the search range: `radius` cells of 8 pixels at the finest of `levels` resolutions, twice as far at each next.
     `all_pairs` keeps every product of two features in memory, 4/3 (height width / 64)^2 floats; otherwise they are
     computed at each update, for large images. Raises `ValueError` for impossible settings.
     """
@@ -251,9 +251,9 @@ class RAFTSmall(AbstractFlowNetwork):
         first: tuple[Float[Array, "rows columns features"], Float[Array, "rows columns context"]],
         second: tuple[Float[Array, "rows columns features"], Float[Array, "rows columns context"]],
     ) -> tuple[Float[Array, "_ _ 2"], ...]:
-        here, remembered = first
+        here, context_features = first
         rows, columns, channels = here.shape
-        hidden, context = jnp.tanh(remembered[..., :_HIDDEN]), jax.nn.relu(remembered[..., _HIDDEN:])
+        hidden, context = jnp.tanh(context_features[..., :_HIDDEN]), jax.nn.relu(context_features[..., _HIDDEN:])
         one = here.reshape(-1, channels) / math.sqrt(channels)
         # The products with a mean are the mean of the products: coarser volumes need no finest volume.
         others = [second[0]]

@@ -94,7 +94,8 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "pyramid_mid": ("pyramid", {"octaves": (-1, 0, 1), "medians": 2}),
     "pyramid_fine": ("pyramid", {"octaves": (-1, 0, 1, 2), "medians": 2}),
 }
-"""Packaged weights with other settings of their network, by name; `<name>:<weights.safetensors>` takes a file's weights."""
+"""Packaged weights with other settings of their network, by name; `<name>:<weights.safetensors>` takes a file's
+weights."""
 
 _UNTRAINED = ("flownet_s", "flownet_c", "raft_small")
 
@@ -120,8 +121,9 @@ def _last_suffix(name: str) -> str | None:
 def make_flow(name: str) -> FlowFunction:
     """A flow by name: `CLASSICAL`, packaged weights (`pyramid`), one of `VARIANTS`, or the path of a weights file.
 
-    `pyramid_fine:<weights.safetensors>` is a variant with the weights of a file, such as fine-tuned ones. `SUFFIXES` may
-    follow and are applied in that order. Raises `ValueError` for any other name, and for weights that cannot be used.
+    `pyramid_fine:<weights.safetensors>` is a variant with the weights of a file, such as fine-tuned ones. `SUFFIXES`
+    may follow and are applied in that order. Raises `ValueError` for any other name, and for weights that cannot be
+    used.
     """
     if (suffix := _last_suffix(name)) is not None:
         return SUFFIXES[suffix][0](make_flow(name.removesuffix(suffix)))

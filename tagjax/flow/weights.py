@@ -54,8 +54,8 @@ def save_weights(
     """Write a network's arrays by name, with `metadata` as JSON; as float16 instead of float32 if `half`.
 
     `metadata["flow"]` are the settings that build the network: `_target_` and arguments, as under conf/flow. The other
-    entries are free: recipe, seed, data, scores. The same content gives the same bytes. Raises `ValueError` for settings
-    that build another network, and for values that are not finite.
+    entries are free: recipe, seed, data, scores. The same content gives the same bytes. Raises `ValueError` for
+    settings that build another network, and for values that are not finite.
     """
     settings = metadata.get("flow")
     if not isinstance(settings, Mapping):

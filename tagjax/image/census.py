@@ -32,8 +32,8 @@ def to_grey(image: Float[Array, "height width 3"]) -> Float[Array, "height width
 def census_offsets(radius: int, stride: int = 1) -> tuple[Offset, ...]:
     """Offsets to half of the neighbours within a square of (2 radius + 1)^2 pixels, every `stride`-th of them.
 
-    The other half is redundant: comparing a with b is comparing b with a at another pixel. Raises `ValueError` for a radius
-    or stride below 1.
+    The other half is redundant: comparing a with b is comparing b with a at another pixel. Raises `ValueError` for a
+    radius or stride below 1.
     """
     if radius < 1 or stride < 1:
         raise ValueError(f"The census has radius {radius} and stride {stride}; expected at least 1 for both.")

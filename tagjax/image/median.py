@@ -12,7 +12,8 @@ def median_filter(image: Float[Array, "height width channel"], size: int) -> Flo
     """Median of each channel over size x size pixels; beyond the image its edge pixels are repeated.
 
     As `scipy.ndimage.median_filter(mode="nearest")`, made of minima and maxima of whole images: XLA fuses them into
-    one loop, while sorting every pixel's neighbours takes twenty times as long. The gradient goes to the median pixel. Raises `ValueError` for an even or negative size.
+    one loop, while sorting every pixel's neighbours takes twenty times as long. The gradient goes to the median pixel.
+    Raises `ValueError` for an even or negative size.
     """
     if size < 1 or size % 2 == 0:
         raise ValueError(f"size is {size}; expected an odd number of pixels.")
@@ -31,12 +32,12 @@ def _comparisons(count: int, wanted: int) -> tuple[tuple[int, int], ...]:
 
     Batcher's odd-even merge sort (AFIPS 1968) without the comparisons that this element does not depend on.
     """
-    kept, needed = [], {wanted}
+    chosen, needed = [], {wanted}
     for pair in reversed(_merge_sort(count)):
         if needed & set(pair):
-            kept.append(pair)
+            chosen.append(pair)
             needed |= set(pair)
-    return tuple(reversed(kept))
+    return tuple(reversed(chosen))
 
 
 def _merge_sort(count: int) -> list[tuple[int, int]]:

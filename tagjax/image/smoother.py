@@ -21,12 +21,12 @@ def fast_global_smooth(
 ) -> Float[Array, "height width channel"]:
     """S(w f) / S(w), where S(g) nearly minimises sum (u - g)^2 + strength sum_{neighbours p, q} b_pq (u_p - u_q)^2.
 
-    The affinity of neighbours is b_pq = exp(-|I_p - I_q| / edge), |.| the mean over the guide's colours. S solves rows and
-    columns alternately, each exactly, with strength 1.5 4^(T-t) / (4^T - 1) in round t of T: the Fast Global Smoother (Min et
-    al., IEEE TIP 2014), and the quotient handles weights as there. A pixel without weight takes the values of its neighbours
-    on the same side of the guide's edges, or keeps its own where no weight reaches it. Solved by
-    `jax.lax.linalg.tridiagonal_solve`. Raises `ValueError` for a negative strength, an edge that is not positive, and
-    fewer than one round.
+    The affinity of neighbours is b_pq = exp(-|I_p - I_q| / edge), |.| the mean over the guide's colours. S solves rows
+    and columns alternately, each exactly, with strength 1.5 4^(T-t) / (4^T - 1) in round t of T: the Fast Global
+    Smoother (Min et al., IEEE TIP 2014), and the quotient handles weights as there. A pixel without weight takes the
+    values of its neighbours on the same side of the guide's edges, or keeps its own where no weight reaches it. Solved
+    by `jax.lax.linalg.tridiagonal_solve`. Raises `ValueError` for a negative strength, an edge that is not positive,
+    and fewer than one round.
     """
     if strength < 0 or edge <= 0 or num_rounds < 1:
         raise ValueError(

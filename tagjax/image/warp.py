@@ -90,8 +90,8 @@ def splat(
     """Forward warp: move every pixel by its flow and distribute it bilinearly over the four pixels around its target.
 
     Where several pixels meet, they are averaged by bilinear weight times `importance` (all 1 if None; use
-    exp(-depth / scale) to favour the nearer, 0 to leave a pixel out: softmax splatting). Returns the image and the mask of
-    pixels that received a value; holes are 0 and False. Differentiable in image, flow and importance.
+    exp(-depth / scale) to favour the nearer, 0 to leave a pixel out: softmax splatting). Returns the image and the mask
+    of pixels that received a value; holes are 0 and False. Differentiable in image, flow and importance.
     """
     height, width, channels = image.shape
     x, y = pixel_grid(height, width, flow_px.dtype)

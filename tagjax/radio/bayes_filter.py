@@ -74,8 +74,8 @@ def filter_reads(reads: PhaseReads, model: RadioModel) -> FilteredPath:
 
     Likelihood of a read: von Mises around the predicted phase with the read's thermal noise and the multipath ripple,
     with probabilities of a pi flip and of an outlier (uniform). Between reads the phase advances by 4 pi f v dt / c
-    (exactly, in the Fourier domain) and velocity diffuses (exactly, in the cosine basis of the grid). At a channel change
-    the phase is blurred by `hop_rad`, the residual of the affine offset model.
+    (exactly, in the Fourier domain) and velocity diffuses (exactly, in the cosine basis of the grid). At a channel
+    change the phase is blurred by `hop_rad`, the residual of the affine offset model.
     """
     num_phases, num_velocities = model.num_phases, model.num_velocities
     dtype = reads.time_s.dtype

@@ -12,7 +12,9 @@ MAX_SLOPE_RAD_HZ = 1.0e-6
 
 @dataclasses.dataclass(frozen=True)
 class ChannelSlope:
-    """Offsets are slope * (f - f0) + a residual of standard deviation `residual_rad` per hop; pi if the slope is unknown."""
+    """Offsets are slope * (f - f0) + a residual of standard deviation `residual_rad` per hop; pi if the slope is
+    unknown.
+    """
 
     slope_rad_hz: float
     residual_rad: float

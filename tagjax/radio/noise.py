@@ -28,9 +28,9 @@ def estimate_flip_probability(
 ) -> float:
     """Probability of an extra pi per read, from phase steps between adjacent reads of one channel.
 
-    A step within 0.5 rad of pi is a transition; independent flips of probability p give 2 p (1 - p) transitions per step.
-    NaN with fewer than 20 pairs of reads at most `max_gap_s` apart. A tag faster than about 2.2 m/s at 30 ms gaps moves
-    as much as a flip and would be taken for one.
+    A step within 0.5 rad of pi is a transition; independent flips of probability p give 2 p (1 - p) transitions per
+    step. NaN with fewer than 20 pairs of reads at most `max_gap_s` apart. A tag faster than about 2.2 m/s at 30 ms gaps
+    moves as much as a flip and would be taken for one.
     """
     if len(time_s) < 2:
         return float("nan")

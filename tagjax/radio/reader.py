@@ -11,7 +11,8 @@ import dataclasses
 import numpy as np
 
 ROUND_BASE_S = 17.3e-3
-"""Inventory round without tags (counted): a round of N tags takes ROUND_BASE_S + N * ROUND_PER_TAG_S, rms error 2 ms."""
+"""Inventory round without tags (counted): a round of N tags takes ROUND_BASE_S + N * ROUND_PER_TAG_S, rms error 2
+ms."""
 
 ROUND_PER_TAG_S = 4.23e-3
 """Time that each further tag adds to a round (counted)."""

@@ -17,9 +17,9 @@ else:
 class PhaseReads(eqx.Module):
     """Reads of one tag in a buffer of fixed length; only elements with `valid` are used.
 
-    Phases grow with distance (the opposite sign of a reader is converted on import into the buffer) and are in [0, 2 pi).
-    `channel` numbers the distinct (antenna, carrier) pairs from 0: phase offsets are constant within a channel only.
-    Arrays may be NumPy arrays, for reads that are still on the host; compiled functions take both.
+    Phases grow with distance (the opposite sign of a reader is converted on import into the buffer) and are in [0, 2
+    pi). `channel` numbers the distinct (antenna, carrier) pairs from 0: phase offsets are constant within a channel
+    only. Arrays may be NumPy arrays, for reads that are still on the host; compiled functions take both.
     """
 
     time_s: Float[_HostOrDevice, "*batch reads"]  # from the recording's first frame

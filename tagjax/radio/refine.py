@@ -48,8 +48,8 @@ def refine_path(
 ) -> RefinedPath:
     """Maximum a posteriori distance at the knots, linear in between, from reads and a start within half a cycle.
 
-    Residuals: (phi_r - 4 pi f_r x(t_r) / c - offset) wrapped modulo pi (so that pi flips have no effect) over the read's
-    noise, flattened for outliers; second differences of the knots over the acceleration prior. Solved by
+    Residuals: (phi_r - 4 pi f_r x(t_r) / c - offset) wrapped modulo pi (so that pi flips have no effect) over the
+    read's noise, flattened for outliers; second differences of the knots over the acceleration prior. Solved by
     Levenberg-Marquardt (Optimistix) with implicit gradients; the covariance is the Laplace approximation.
     """
     dtype = knot_s.dtype

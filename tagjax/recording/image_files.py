@@ -51,7 +51,9 @@ def _png_is_complete(data: bytes) -> bool:
 
 
 def read_image(path: Path, flags: int) -> np.ndarray:
-    """An image file decoded by OpenCV with these flags (cv2.IMREAD_...). Raises `RecordingError` for a truncated or damaged file."""
+    """An image file decoded by OpenCV with these flags (cv2.IMREAD_...). Raises `RecordingError` for a truncated or
+    damaged file.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -48,8 +48,8 @@ def open_recordings(paths: Sequence[str], virtual_tag: VirtualTagSettings) -> li
 def with_virtual_tags(recording: Recording, settings: VirtualTagSettings) -> Recording:
     """The recording with a virtual tag on each tracked label, for each seed, read as if it were the only tag.
 
-    Unchanged if no tracks are given. Raises `ConfigError` for invalid settings of the reader, `RecordingError` for files
-    that do not fit the recording.
+    Unchanged if no tracks are given. Raises `ConfigError` for invalid settings of the reader, `RecordingError` for
+    files that do not fit the recording.
     """
     if settings.tracks is None:
         return recording

@@ -33,8 +33,8 @@ class TagReads:
     """Tag reads in order of host time, one array element per read.
 
     `carrier_hz` is NaN where the carrier is unknown (a channel index without its hop table); `doppler_hz` and
-    `rssi_dbm` are NaN where the reader reported none. `phase_rad` is as reported, in [0, phase_period_rad); it grows with
-    distance where `phase_sign` is +1 (Impinj), shrinks where it is -1.
+    `rssi_dbm` are NaN where the reader reported none. `phase_rad` is as reported, in [0, phase_period_rad); it grows
+    with distance where `phase_sign` is +1 (Impinj), shrinks where it is -1.
     """
 
     epc: np.ndarray  # (num_reads,) str

@@ -1,4 +1,5 @@
-"""Recordings in local or remote storage: Zarr v3, one chunk per frame, zstd; opened lazily, checked for missing parts."""
+"""Recordings in local or remote storage: Zarr v3, one chunk per frame, zstd; opened lazily, checked for missing
+parts."""
 
 from __future__ import annotations
 
@@ -128,8 +129,8 @@ def _plain(value: Any, where: str) -> Any:
 def open_recording(path: str | Path, *, check: bool = True) -> Recording:
     """Open a recording lazily from a folder or any fsspec address (memory://, s3://, https://).
 
-    Frames are read when indexed. Raises `RecordingError` for a folder that is no recording, a recording of another version,
-    and one with missing parts.
+    Frames are read when indexed. Raises `RecordingError` for a folder that is no recording, a recording of another
+    version, and one with missing parts.
     """
     remote = "://" in str(path)
     if not remote and not Path(path).is_dir():

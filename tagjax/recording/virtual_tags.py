@@ -52,8 +52,8 @@ class Track:
     def at(self, time_s: np.ndarray) -> np.ndarray:
         """Position at any time, (len(time_s), 3) metres; NaN outside the segments.
 
-        Cubic Hermite interpolation with central-difference velocities, so that phases between frames are those of smooth
-        motion, even if the range changes by more than half a wavelength per frame.
+        Cubic Hermite interpolation with central-difference velocities, so that phases between frames are those of
+        smooth motion, even if the range changes by more than half a wavelength per frame.
         """
         out = np.full((len(time_s), 3), np.nan)
         for segment in self.segments():
@@ -102,7 +102,8 @@ def virtual_reads(
     origin_ns: int = 0,
     reader: ReaderState | None = None,
 ) -> TagReads:
-    """Simulated reads of a tag on a track: schedule, hopping, phase with noise, multipath ripple and pi flips, RSSI, Doppler.
+    """Simulated reads of a tag on a track: schedule, hopping, phase with noise, multipath ripple and pi flips, RSSI,
+    Doppler.
 
     Read times are drawn over the whole track; reads without a position or below the reader's sensitivity are left out.
     The same seed gives the same reads.
@@ -156,7 +157,8 @@ def attach_virtual_tags(
     seed: int,
     epc_of: Callable[[int], str] = default_epc,
 ) -> Recording:
-    """The recording with a virtual tag on each track instead of its own reads; the truth has labels, ranges and positions.
+    """The recording with a virtual tag on each track instead of its own reads; the truth has labels, ranges and
+    positions.
 
     All tags are read by one reader at the first antenna, each on the schedule of `settings`.
     """

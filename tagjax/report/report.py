@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 
+from ..core.files import write_atomic
 from ..metrics.recordings import RecordingResult
 from ..metrics.tracking import Scores, label_box
 from .overlay import draw_overlay, short_name
@@ -41,10 +41,8 @@ def summarise(results: Results) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON atomically. NaN and infinity become null."""
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(json.dumps(plain(content), indent=2) + "\n", encoding="utf-8")
-    os.replace(beside, path)
+    """Write a JSON file that appears whole or not at all. NaN and infinity become null."""
+    write_atomic(path, json.dumps(plain(content), indent=2) + "\n")
 
 
 def plain(content: Any) -> Any:

@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
+from ..core.files import write_atomic
 from .processes import is_first
 
 _FINISH_S = 600.0
@@ -39,9 +40,7 @@ class MetricsFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists():
             kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= resume_step]
-            beside = path.with_name(path.name + ".part")
-            beside.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
-            os.replace(beside, path)
+            write_atomic(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         with self.path.open("a", encoding="utf-8") as file:

@@ -1,4 +1,5 @@
-"""Clock audit: whether the reader's clock was set, and the offset and drift between the host's and the reader's clock."""
+"""Clock audit: whether the reader's clock was set, and the offset and drift between the host's and the reader's
+clock."""
 
 from __future__ import annotations
 
@@ -22,11 +23,12 @@ def reader_epoch(reader_ns: np.ndarray) -> str:
 
 
 def audit_clocks(reader_ns: np.ndarray, host_ns: np.ndarray) -> ClockAudit:
-    """Offset and drift of the host's clock against the reader's, from the reader's read times and the host's arrival times.
+    """Offset and drift of the host's clock against the reader's, from the reader's read times and the host's arrival
+    times.
 
-    Queues delay arrivals by varying amounts: the earliest arrival of each of up to 60 time intervals is used, and a line
-    is fitted to them without outliers. The minimum latency remains in the offset. Raises `RecordingError` for fewer than
-    two times, or different numbers of them.
+    Queues delay arrivals by varying amounts: the earliest arrival of each of up to 60 time intervals is used, and a
+    line is fitted to them without outliers. The minimum latency remains in the offset. Raises `RecordingError` for
+    fewer than two times, or different numbers of them.
     """
     if len(reader_ns) != len(host_ns) or len(reader_ns) < 2:
         raise RecordingError(f"{len(reader_ns)} reader and {len(host_ns)} host times; a clock audit needs two of each.")

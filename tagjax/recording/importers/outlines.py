@@ -1,4 +1,5 @@
-"""Outlines of moving objects in depth maps and edges in colour images, which the estimate of the registration compares."""
+"""Outlines of moving objects in depth maps and edges in colour images, which the estimate of the registration
+compares."""
 
 from __future__ import annotations
 
@@ -63,7 +64,7 @@ def depth_outlines(depth_mm: np.ndarray, view: DepthToColour) -> Outlines:
 
         ends = [project_to_colour(lifted(at + sign * along), view) for sign in (-1.0, 1.0)]
         tangent = ends[1] - ends[0]
-        angle = np.arctan2(tangent[:, 0], -tangent[:, 1])  # of the normal, in the colour picture
+        angle = np.arctan2(tangent[:, 0], -tangent[:, 1])  # of the normal, in the colour image
         direction = np.rint(angle / np.pi * NUM_DIRECTIONS).astype(int) % NUM_DIRECTIONS
         points.append(lifted(at))
         channels.append(frame * NUM_DIRECTIONS + direction)
@@ -99,15 +100,15 @@ def colour_edges(colour: np.ndarray) -> np.ndarray:
     static = np.median(colour, axis=0).astype(np.float32)
     own = cv2.dilate(_gradients(static).transpose(1, 2, 0), np.ones((3, 3), np.uint8)).transpose(2, 0, 1)
     out = []
-    for picture in colour:
-        new = np.maximum(_gradients(picture.astype(np.float32)) - 1.2 * own, 0)
+    for image in colour:
+        new = np.maximum(_gradients(image.astype(np.float32)) - 1.2 * own, 0)
         out.append((new / (new + EDGE_HALF)).astype(np.float16))
     return np.concatenate(out)
 
 
-def _gradients(picture: np.ndarray) -> np.ndarray:
+def _gradients(image: np.ndarray) -> np.ndarray:
     """Derivative of the strongest channel along NUM_DIRECTIONS normals, grey levels per pixel: (directions, h, w)."""
-    smooth = cv2.GaussianBlur(picture, (0, 0), 1.0)
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     x, y = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
     angles = np.arange(NUM_DIRECTIONS) * np.pi / NUM_DIRECTIONS
     return np.stack([np.abs(np.cos(a) * x + np.sin(a) * y).max(axis=-1) for a in angles]).astype(np.float32)

@@ -88,10 +88,10 @@ def misalignment_px(
     """Distance between projected depth outlines and colour edges, in pixels of the colour image.
 
     For each moving object in each frame: the shift (within `SEARCH_PX`) of its projected outline with the highest mean
-    strength of colour edges of the same direction; objects with an ambiguous shift are left out. RGB images and raw depth
-    (depth camera's view, millimetres, 0 = missing) of a static camera, a dozen frames or more, preferably far apart in
-    time: the static scene is their median. Noisy depth outlines give about 1.5 px even if the registration is correct.
-    Raises `RecordingError` with fewer than `MIN_OBJECTS` unambiguous objects.
+    strength of colour edges of the same direction; objects with an ambiguous shift are left out. RGB images and raw
+    depth (depth camera's view, millimetres, 0 = missing) of a static camera, a dozen frames or more, preferably far
+    apart in time: the static scene is their median. Noisy depth outlines give about 1.5 px even if the registration is
+    correct. Raises `RecordingError` with fewer than `MIN_OBJECTS` unambiguous objects.
     """
     _check(colour, depth_mm)
     return _measure(depth_outlines(depth_mm, view), blurred(colour_edges(colour), BLURS_PX[-1]), view)
@@ -106,8 +106,8 @@ def estimate_correction(
 
     Frames as for `misalignment_px`: thirty or more, evenly spread over a recording in which a person walks. All seven
     parameters are estimated jointly, coarse to fine (from errors of up to 20 px), with the prior `PRIOR_SPREAD`:
-    translation and principal point have similar effects, as have dTz and the focal factors, unless outlines are at clearly
-    different depths. The projection of points at the observed depths is reliable, not the single parameters.
+    translation and principal point have similar effects, as have dTz and the focal factors, unless outlines are at
+    clearly different depths. The projection of points at the observed depths is reliable, not the single parameters.
     Deterministic; without an improvement, no correction. Raises `RecordingError` if outlines are too few or ambiguous.
     """
     _check(colour, depth_mm)
@@ -153,12 +153,12 @@ def estimate_folder_correction(folder: str | Path, calibration: str | Path) -> R
 
     Raises `RecordingError` if there are no images, or they differ in size.
     """
-    pictures = natural_sorted(Path(folder).glob("*.jpg"))
-    if not pictures:
+    images = natural_sorted(Path(folder).glob("*.jpg"))
+    if not images:
         raise RecordingError(f"{folder}: no .jpg file; expected images with .mat files of the same names.")
-    pictures = [pictures[i] for i in _evenly_spaced(len(pictures), FOLDER_FRAMES)]
+    images = [images[i] for i in _evenly_spaced(len(images), FOLDER_FRAMES)]
     frames = []
-    for read, paths in ((read_colour, pictures), (read_mat_depth, [path.with_suffix(".mat") for path in pictures])):
+    for read, paths in ((read_colour, images), (read_mat_depth, [path.with_suffix(".mat") for path in images])):
         decoded = [read(path) for path in paths]
         for path, frame in zip(paths, decoded, strict=True):
             if frame.shape != decoded[0].shape:

@@ -29,7 +29,9 @@ class DepthToColour:
     translation_m: np.ndarray
 
     def corrected(self, correction: Sequence[float]) -> DepthToColour:
-        """The same cameras with a residual correction: (dTx, dTy, dTz) metres, factors on fx and fy, shifts of cx and cy in pixels."""
+        """The same cameras with a residual correction: (dTx, dTy, dTz) metres, factors on fx and fy, shifts of cx and
+        cy in pixels.
+        """
         dx, dy, dz, scale_x, scale_y, shift_x, shift_y = correction
         camera = self.colour_camera
         return dataclasses.replace(
@@ -139,7 +141,7 @@ def import_jpg_mat(
     images = natural_sorted(folder.glob("*.jpg"))
     if not images:
         raise RecordingError(f"{folder}: no .jpg file; expected images with .mat files of the same names.")
-    depths = [picture.with_suffix(".mat") for picture in images]
+    depths = [image.with_suffix(".mat") for image in images]
     absent = [depth.name for depth in depths if not depth.is_file()]
     if absent:
         raise RecordingError(
@@ -194,11 +196,12 @@ TUM_UNITS_PER_M = 5000.0
 
 
 def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: float = 0.02) -> Recording:
-    """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each image with the depth nearest in time.
+    """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each image with the depth nearest in
+    time.
 
-    The camera follows from the folder's name if not given; lens distortion is removed frame by frame. Images without depth
-    within `max_gap_s` are left out; the recording's `source` states how many. Raises `RecordingError` for missing or
-    malformed files and an unknown camera.
+    The camera follows from the folder's name if not given; lens distortion is removed frame by frame. Images without
+    depth within `max_gap_s` are left out; the recording's `source` states how many. Raises `RecordingError` for missing
+    or malformed files and an unknown camera.
     """
     folder = Path(folder)
     listings = {kind: _tum_listing(folder / f"{kind}.txt") for kind in ("rgb", "depth")}
@@ -208,12 +211,12 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
     depth_s = np.array([stamp for stamp, _ in listings["depth"]])
     order = np.argsort(depth_s)
     pairs, dropped = [], 0
-    for stamp, picture in sorted(listings["rgb"]):
+    for stamp, image in sorted(listings["rgb"]):
         place = np.searchsorted(depth_s[order], stamp)
         near = order[np.clip([place - 1, place], 0, len(order) - 1)]
         best = near[np.argmin(np.abs(depth_s[near] - stamp))]
         if abs(depth_s[best] - stamp) <= max_gap_s:
-            pairs.append((stamp, picture, listings["depth"][best][1]))
+            pairs.append((stamp, image, listings["depth"][best][1]))
         else:
             dropped += 1
     if not pairs:
@@ -232,10 +235,10 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
     lens = Intrinsics(fx, fy, cx, cy, shape[1], shape[0], distortion)
 
     def colour(path: Path) -> np.ndarray:
-        picture = read_colour(path)
-        if not distortion or picture.shape != shape:  # FrameFiles refuses another shape, with the file's name
-            return picture
-        return undistort(picture, np.zeros(shape[:2], np.float32), lens)[0]
+        image = read_colour(path)
+        if not distortion or image.shape != shape:  # FrameFiles refuses another shape, with the file's name
+            return image
+        return undistort(image, np.zeros(shape[:2], np.float32), lens)[0]
 
     def depth_mm(path: Path) -> np.ndarray:
         raw = read_image(path, cv2.IMREAD_UNCHANGED)

@@ -27,7 +27,7 @@ class ImportSettings:
     video_format: str = "auto"  # tum | jpg_mat | auto
     calibration: str | None = None  # jpg_mat: .mat with cam_params
     correction: Any = None  # jpg_mat: residual correction of the calibration: null | 7 numbers | estimate
-    masks: str | None = None  # jpg_mat: folder of label pictures
+    masks: str | None = None  # jpg_mat: folder of label images
     fps: float = 30.0  # jpg_mat: frame rate, since the folder has no times
     reads: str | None = None
     format: str = "auto"

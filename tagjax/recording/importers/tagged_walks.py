@@ -60,7 +60,9 @@ class TaggedRecording:
 
 
 def read_kinect(path: Path) -> Rows:
-    """The tracks of a file (id, time, x cm, z cm) by id: seconds, x and z in metres. Raises `RecordingError` for other lines."""
+    """The tracks of a file (id, time, x cm, z cm): seconds, x, z in metres, by id. Raises `RecordingError` for other
+    lines.
+    """
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for line, text in enumerate(path.read_text().splitlines(), start=1):
         try:
@@ -96,21 +98,19 @@ def read_speeds(path: Path) -> dict[str, Speeds]:
 def load_tagged(folder: Path, rate_hz: float) -> list[TaggedRecording]:
     """All tags of all files <name>.txt of tracks with a file RFID_<name>.txt; times in seconds from the first track on.
 
-    Raises `RecordingError` for files with other lines or without a track.
+    Raises `RecordingError` for files that hold other lines, or no track.
     """
     found = []
     for path in sorted(folder.glob("[0-9]*.txt")):
-        reads_path = path.with_name(f"RFID_{path.name}")
-        if not reads_path.is_file():
+        beside = path.with_name(f"RFID_{path.name}")
+        if not beside.is_file():
             continue
         rows = {track_id: np.array(own) for track_id, own in read_kinect(path).items() if len(own) > 1}
         if not rows:
-            raise RecordingError(
-                f"{path}: found no track of two samples or more, expected at least one. Is the file complete?"
-            )
+            raise RecordingError(f"{path}: no track of two samples or more.")
         start = min(own[0, 0] for own in rows.values())
         walks = tuple(_walk(track_id, own - np.array([start, 0.0, 0.0]), rate_hz) for track_id, own in rows.items())
-        for epc, speeds in read_speeds(reads_path).items():
+        for epc, speeds in read_speeds(beside).items():
             moved = dataclasses.replace(speeds, time_s=speeds.time_s - start)
             found.append(TaggedRecording(path.stem, walks, epc, moved))
     return found
@@ -120,8 +120,8 @@ def read_xovis(path: Path, unit_m: float) -> Rows:
     """The tracks of a table ;time;id;x;y;... (ms; x and y in units of `unit_m`). Raises `RecordingError` for others."""
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for row in _table(path, {"time", "id", "x", "y"}):
-        position = float(row["x"]) * unit_m, float(row["y"]) * unit_m
-        rows.setdefault(row["id"], []).append((float(row["time"]) * 1e-3, *position))
+        place = float(row["x"]) * unit_m, float(row["y"]) * unit_m
+        rows.setdefault(row["id"], []).append((float(row["time"]) * 1e-3, *place))
     return rows
 
 
@@ -130,9 +130,7 @@ def _table(path: Path, columns: set[str]) -> list[dict[str, str]]:
         table = csv.DictReader(file, delimiter=";")
         missing = columns - set(table.fieldnames or ())
         if missing:
-            raise RecordingError(
-                f"{path}: found columns {table.fieldnames}, expected also {', '.join(sorted(missing))}. Is it the right file?"
-            )
+            raise RecordingError(f"{path}: columns {', '.join(sorted(missing))} are missing; found {table.fieldnames}.")
         return list(table)
 
 
@@ -184,5 +182,5 @@ def _speeds_of_path(path: Float[np.ndarray, "samples 3"]) -> Speeds:
 def _walk(name: str, rows: Float[np.ndarray, "samples 3"], rate_hz: float) -> Walk:
     seconds, first = np.unique(rows[:, 0], return_index=True)
     clock = np.arange(seconds[0], seconds[-1], 1.0 / rate_hz)
-    position = np.stack([np.interp(clock, seconds, rows[first, axis]) for axis in (1, 2)], axis=1)
-    return Walk(name, clock, scipy.ndimage.gaussian_filter1d(position, SMOOTH_S * rate_hz, axis=0))
+    place = np.stack([np.interp(clock, seconds, rows[first, axis]) for axis in (1, 2)], axis=1)
+    return Walk(name, clock, scipy.ndimage.gaussian_filter1d(place, SMOOTH_S * rate_hz, axis=0))
