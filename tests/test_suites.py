@@ -1,4 +1,4 @@
-"""Benchmark suites: every file under conf/benchmark is one, splits are apart, and runs resume and repeat exactly."""
+"""Suites: every file under conf/benchmark is one, splits are apart, and runs resume and repeat exactly."""
 
 from __future__ import annotations
 
@@ -445,7 +445,7 @@ def test_a_folder_with_other_contents_is_left_unchanged(tmp_path):
     home = tmp_path / "tiny"
     home.mkdir()
     (home / "thesis.txt").write_text("precious")
-    with pytest.raises(RecordingError, match="has no readable suite.json"):
+    with pytest.raises(RecordingError, match=r"has no readable suite\.json"):
         make_suite(_tiny(), tmp_path)
     assert [path.name for path in home.iterdir()] == ["thesis.txt"]
     (home / "thesis.txt").unlink()
