@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tagjax._numerics import SPEED_OF_LIGHT_M_S
-from tagjax.data.store import save_recording
+from tagjax.core.numerics import SPEED_OF_LIGHT_M_S
+from tagjax.radio.reads import PhaseReads, RadioWindow
 from tagjax.recording import Intrinsics, Recording, TagReads, Truth
-from tagjax.rf.reads import PhaseReads, RadioWindow
-from tagjax.tracer import AbstractTracer, Camera, Frame, Trace
+from tagjax.recording.store import save_recording
+from tagjax.tracing.tracer import AbstractTracer, Camera, Frame, Trace
 
 HEIGHT, WIDTH, WINDOW, MAX_READS = 24, 32, 5, 8
 BOXES = {1: (4, 5, 11, 16), 2: (18, 6, 27, 18)}  # inclusive x0 y0 x1 y1
@@ -191,7 +191,7 @@ class SmallTracer(AbstractTracer):
             centre_m=jnp.zeros((num_tags, 3)),
             step_m=(jnp.sum(mask * change[None], axis=(1, 2)) / (total + 1e-6))[:, None],
             confidence=jnp.max(mask, axis=(1, 2)),
-            found=jnp.any(mask > 0.5, axis=(1, 2)),
+            detected=jnp.any(mask > 0.5, axis=(1, 2)),
         )
 
     def finish(self, state: SmallState) -> SmallState:

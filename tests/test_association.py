@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment, linprog
 
-from tagjax.association import hard_assignment, sinkhorn
+from tagjax.core.assignment import hard_assignment, sinkhorn
 
 RNG = np.random.default_rng(0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from tagjax.background import empty_background, in_front, is_background, remember
+from tagjax.tagattention.background import empty_background, in_front, is_background, remember
 
 
 def _full(value: float) -> jnp.ndarray:

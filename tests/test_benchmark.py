@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tagjax.config import ConfigError, from_mapping
-from tagjax.evaluation.benchmark import CASES, BenchmarkSettings, machine, run_benchmark
+from tagjax.benchmarks.stages import CASES, BenchmarkSettings, run_benchmark
+from tagjax.core.machine import machine
+from tagjax.core.settings import ConfigError, from_mapping
 
 
 def test_cases_give_times_of_both_and_their_ratio():

@@ -11,14 +11,14 @@ import pytest
 from radio_environments import box_room, free_space, infinite_planes, point_scatterers
 from scipy.optimize import fminbound, minimize
 
-from tagjax.data.importers.clock import audit_clocks
-from tagjax.rf.noise import pi_flip_share
+from tagjax.radio.noise import pi_flip_share
+from tagjax.radio.reader import HOP_TABLES_HZ, ReaderState
+from tagjax.recording.importers.clock import audit_clocks
+from tagjax.recording.virtual_tags import Track
 from tagjax.sim.radio import channel
 from tagjax.sim.radio.channel import one_way_gain
 from tagjax.sim.radio.environment import Environment, Planes, Scatterers
 from tagjax.sim.radio.inventory import InventorySettings, clock_stamps, draw_schedule, simulate_inventory
-from tagjax.sim.reader import HOP_TABLES_HZ, ReaderState
-from tagjax.sim.virtual_tag import Track
 
 C = 299_792_458.0
 F = 915.25e6

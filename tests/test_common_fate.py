@@ -10,12 +10,12 @@ import pytest
 import synthetic_clips as synthetic
 from scipy.spatial.transform import Rotation
 
-from tagjax.common_fate import common_fate, fate_attention, shared_shift
-from tagjax.geometry import pixel_rays
-from tagjax.motion import empty_places, push_places
+from tagjax.core.geometry import pixel_rays
 from tagjax.recording import Intrinsics
 from tagjax.tagattention import TagAttention
-from tagjax.tracer import Camera, Frame, trace
+from tagjax.tagattention.common_fate import common_fate, fate_attention, shared_shift
+from tagjax.tagattention.motion import empty_places, push_places
+from tagjax.tracing.tracer import Camera, Frame, trace
 
 SPREAD, SLACK, FLOOR = 0.015, 0.25, 0.02
 THING, ARM = np.array([0.03, -0.05, 0.02]), np.array([-0.04, 0.06, 0.02])

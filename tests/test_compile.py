@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from tagjax._compile import large_program
+from tagjax.core.compilation import large_program
 
 
 @pytest.mark.parametrize("level", [None, 1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override
 from omegaconf import OmegaConf
 
-from experiments.benchmark import with_cases
-from experiments.compare import with_suites
-from tagjax.config import EvaluateConfig, SimulateConfig, TrainConfig, TrainFlowConfig, from_mapping
+from tagjax.core.settings import from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
+from tagjax.evaluation.run import EvaluateConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
+from tagjax.sim.suites import SimulateConfig
+from tagjax.training.config import TrainConfig
+from tagjax.training.flow_config import TrainFlowConfig
 
 ROOT = Path(__file__).parents[1]
 SCHEMAS: dict[str, type] = {
@@ -32,7 +33,6 @@ SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
     "train_flow": TrainFlowConfig,
 }
-REWORDED: dict[str, Callable[[list[str]], list[str]]] = {"benchmark": with_cases, "compare": with_suites}
 _COMMAND = re.compile(r"python -m experiments\.(\w+)([^`\n]*)")
 
 
@@ -69,8 +69,8 @@ def _one_of(override: Override) -> str:
 @pytest.mark.parametrize(("name", "words"), _documented())
 def test_a_documented_command_composes(name: str, words: tuple[str, ...]) -> None:
     assert (ROOT / "experiments" / f"{name}.py").is_file()
-    plain = [word for word in REWORDED.get(name, list)(list(words)) if not word.startswith("-")]
-    if "search=optuna" in plain:  # its defaults name the sweeper's own
+    plain = [word for word in words if not word.startswith("-")]
+    if "hparams_search=optuna" in plain:  # its defaults name the sweeper's own
         pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs the sweep extra")
     parsed = OverridesParser.create().parse_overrides(plain)
     own = [one for one in parsed if not one.key_or_group.startswith("hydra")]  # launchers need their plugins

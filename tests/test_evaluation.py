@@ -17,21 +17,15 @@ import pytest
 import synthetic_clips as synthetic
 from rich.console import Console
 
-from tagjax.evaluation.evaluate import (
-    ScoreSettings,
-    _tags,
-    box_to_picture,
-    evaluate_recording,
-    mask_to_picture,
-    score_traces,
-    trace_recording,
-)
-from tagjax.evaluation.metrics import box_iou, label_box
-from tagjax.evaluation.report import plain, score_table, summarise, write_report
+from tagjax.metrics.recordings import ScoreSettings, box_to_picture, evaluate_recording, mask_to_picture, score_traces
+from tagjax.metrics.tracking import box_iou, label_box
 from tagjax.recording import RecordingError
+from tagjax.report.overlay import MIN_WIDTH, _extent, _free_place
+from tagjax.report.report import plain, score_table, summarise, write_report
 from tagjax.tagattention import TagAttention
-from tagjax.tracer import Trace, describe, trace
-from tagjax.viz.overlay import MIN_WIDTH, _extent, _free_place
+from tagjax.tagattention.frame_trace import describe
+from tagjax.tracing.recordings import _tags, trace_recording
+from tagjax.tracing.tracer import Trace, trace
 
 EPCS = list(synthetic.EPCS)
 
@@ -106,18 +100,18 @@ def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
             centre_m=jnp.zeros((3, 3)),
             step_m=jnp.zeros((3, 1)),
             confidence=jnp.ones(3),
-            found=jnp.array([True, False, claimed]),
+            detected=jnp.array([True, False, claimed]),
         )
 
     traces = [(number, said(number in (3, 4, 9))) for number in range(12)]
     result = score_traces(traces, recording, names)
     scores = result.scores().result()
-    assert scores["false_claims"] == pytest.approx(3 / 12)
+    assert scores["false_detections"] == pytest.approx(3 / 12)
     of_labelled = [tag.result() for tag in result.tag_scores().values()]
     assert scores["num_frames"] == sum(tag["num_frames"] or 0 for tag in of_labelled)
-    assert all("false_claims" not in tag for tag in of_labelled)
+    assert all("false_detections" not in tag for tag in of_labelled)
     blind = dataclasses.replace(recording, truth=None)
-    assert "false_claims" not in score_traces(traces, blind, names).scores().result()
+    assert "false_detections" not in score_traces(traces, blind, names).scores().result()
 
 
 def test_without_truth_there_are_pictures_but_no_scores() -> None:
@@ -206,7 +200,9 @@ def test_report_is_complete(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * 30
     by_hand = [
-        float(r["iou"]) for r in rows if r["tracer"] == "blunt" and r["shown"] == r["moved"] == r["found"] == "1"
+        float(r["iou"])
+        for r in rows
+        if r["tracer"] == "blunt" and r["visible"] == r["has_moved"] == r["detected"] == "1"
     ]
     assert summary["blunt"]["all"]["iou"] == pytest.approx(np.sum(by_hand) / summary["blunt"]["all"]["num_frames"])
     pictures = sorted((tmp_path / "overlays" / "synthetic" / "learned").glob("*.png"))

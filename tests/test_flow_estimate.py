@@ -27,11 +27,9 @@ from jaxtyping import Array, Float
 import tagjax.flow
 import tagjax.flow.estimates
 import tagjax.flow.weights
-from tagjax.arrays_file import named_arrays
-from tagjax.config import build
-from tagjax.data.clips import load_clip
-from tagjax.data.flow_cache import pair_flow
-from tagjax.data.store import open_recording, save_recording
+from tagjax.core.arrays_file import named_arrays
+from tagjax.core.build import build
+from tagjax.flow.cache import pair_flow
 from tagjax.flow.estimates import NetworkFlow, agreement, estimate, flow_along, one_way, padding
 from tagjax.flow.losses import occluded
 from tagjax.flow.named import CLASSICAL, VARIANTS, flow_key, make_flow
@@ -40,6 +38,8 @@ from tagjax.flow.pictures import as_bytes, check_pictures
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.stillness import settled
 from tagjax.flow.weights import load_network, load_weights, save_weights, weights_about
+from tagjax.recording.store import open_recording, save_recording
+from tagjax.tracing.clips import load_clip
 
 CONF = Path(__file__).parents[1] / "conf" / "flow"
 SETTINGS = {

@@ -6,18 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tagjax.core.geometry import backproject, crop_resize, depth_to_range, pixel_rays, project, range_to_depth, register_depth, undistort, undistorted_positions
 from tagjax.flow.opencv import make_flow
-from tagjax.geometry import (
-    backproject,
-    crop_resize,
-    depth_to_range,
-    pixel_rays,
-    project,
-    range_to_depth,
-    register_depth,
-    undistort,
-    undistorted_positions,
-)
 from tagjax.recording import Intrinsics
 
 CAMERA = Intrinsics(53.0, 54.0, 31.2, 24.1, 64, 48)

@@ -14,15 +14,16 @@ import pytest
 import synthetic_clips as synthetic
 from test_flow_training import small_network
 
-from tagjax.config import ConfigError, TrainConfig, from_mapping
-from tagjax.data.clips import Clip, load_clip
-from tagjax.data.store import save_recording
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.stillness import has_moved, settled
 from tagjax.flow.weights import load_network, save_weights
 from tagjax.recording import Recording
+from tagjax.recording.store import save_recording
 from tagjax.tagattention import TagAttention
+from tagjax.tracing.clips import Clip, load_clip
+from tagjax.training.config import TrainConfig
 from tagjax.training.joint import JointModel, network_flow
 from tagjax.training.loss import ObjectiveSettings
 from tagjax.training.run import make_model, run_training

@@ -1,4 +1,4 @@
-"""The house rules: imports point down, the package imports light, public names are documented and tracers final."""
+"""The structure of the package: strict layers, light imports, documented public names, thin entry points."""
 
 import ast
 import subprocess
@@ -6,97 +6,82 @@ import sys
 from pathlib import Path
 
 import equinox as eqx
-import pytest
 
 import tagjax.tagattention
-import tagjax.tagattention_paper
-import tagjax.tracer
+import tagjax.tagattention.paper
+import tagjax.tracing.tracer
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "tagjax"
 
-LAYERS = {
-    "_types": 0,
-    "_numerics": 0,
-    "_compile": 0,
-    "arrays_file": 0,
-    "recording": 1,
-    "geometry": 1,
-    "association": 1,
-    "image": 1,
-    "rf": 1,
-    "flow": 2,
-    "motion": 2,
-    "attention": 2,
-    "propagation": 2,
-    "common_fate": 2,
-    "segmentation": 2,
-    "anchor": 2,
-    "background": 2,
-    "phases": 2,
-    "parameters": 1,
-    "tracer": 3,
-    "view": 3,
-    "phase_memory": 3,
-    "tagattention": 3,
-    "tagattention_paper": 3,
-    "learned": 3,
-    "baselines": 3,
-    "sim": 3,
-    "data": 3,
-    "training": 4,
-    "evaluation": 4,
-    "viz": 4,
-    "config": 4,
-}
+LAYERS = (
+    {"core"},
+    {"image", "radio"},
+    {"recording"},
+    {"flow", "sim"},
+    {"tracing"},
+    {"tagattention", "metrics"},
+    {"report"},
+    {"training", "baselines"},
+    {"evaluation", "benchmarks"},
+)
+"""Packages from the bottom up. A package imports only packages of the layers below its own."""
 
-MODULES = sorted(PACKAGE.rglob("*.py"))
+LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
+
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
 
 
-def _part(path: Path) -> str:
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+def _package(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0]
 
 
-def _imported_parts(path: Path) -> set[str]:
+def _imports(path: Path) -> set[tuple[str, ...]]:
+    """Dotted names, split, of every module that a file imports, at its top or inside of a function."""
     here = path.relative_to(ROOT).with_suffix("").parts
-    if here[-1] == "__init__":
-        here = (*here[:-1], "")
-    parts = set()
+    found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
             base = here[: len(here) - node.level] if node.level else ()
-            full = [*base, *(node.module.split(".") if node.module else [])]
-            if full and full[0] == "tagjax":
-                parts |= {full[1]} if len(full) > 1 else {alias.name for alias in node.names}
+            module = (*base, *(node.module.split(".") if node.module else ()))
+            found |= {(*module, alias.name) for alias in node.names}
         elif isinstance(node, ast.Import):
-            parts |= {a.name.split(".")[1] for a in node.names if a.name.startswith("tagjax.")}
-    return parts
+            found |= {tuple(alias.name.split(".")) for alias in node.names}
+    return found
 
 
-@pytest.mark.parametrize("path", [m for m in MODULES if m.parent != PACKAGE or m.name != "__init__.py"], ids=str)
-def test_imports_point_down(path):
-    own = LAYERS[_part(path)]
-    for part in _imported_parts(path) & set(LAYERS):
-        assert LAYERS[part] <= own, f"{path.name} (layer {own}) imports {part} (layer {LAYERS[part]})"
+def test_packages_import_only_lower_layers():
+    assert {_package(path) for path in MODULES} == set(LAYER)
+    wrong = [
+        f"{path.relative_to(ROOT)} (layer {LAYER[_package(path)]}) imports {name[1]} (layer {LAYER[name[1]]})"
+        for path in MODULES
+        for name in _imports(path)
+        if name[0] == "tagjax" and len(name) > 1 and name[1] != _package(path)
+        and LAYER.get(name[1], 0) >= LAYER[_package(path)]
+    ]  # fmt: skip
+    assert not wrong, "\n".join(wrong)
 
 
-def test_every_module_has_a_layer():
-    assert {_part(path) for path in MODULES} - {"__init__"} <= set(LAYERS)
+def test_only_the_entry_points_import_hydra_and_nothing_unpickles():
+    forbidden = {"hydra", "omegaconf", "pickle", "cloudpickle", "dill"}
+    wrong = [
+        f"{path.relative_to(ROOT)}: {name[0]}" for path in MODULES for name in _imports(path) if name[0] in forbidden
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=str)
-def test_hydra_stays_in_the_entry_points(path):
-    imported = {
-        alias.name.split(".")[0]
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Import)
-        for alias in node.names
-    } | {
-        (node.module or "").split(".")[0]
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ImportFrom) and not node.level
-    }
-    assert not imported & {"hydra", "omegaconf", "pickle", "cloudpickle", "dill"}
+def test_public_names_are_documented():
+    wrong = []
+    for path in [PACKAGE / "__init__.py", *MODULES]:
+        tree = ast.parse(path.read_text())
+        named = [node for node in tree.body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+        wrong += [] if ast.get_docstring(tree) else [str(path.relative_to(ROOT))]
+        wrong += [
+            f"{path.relative_to(ROOT)}: {node.name}"
+            for node in named
+            if not node.name.startswith("_") and not ast.get_docstring(node)
+        ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_the_package_imports_light():
@@ -108,28 +93,19 @@ def test_the_package_imports_light():
     assert done.returncode == 0, done.stderr
 
 
-def test_what_the_forerunners_share_needs_no_opencv():
+def test_the_interface_of_the_baselines_needs_no_opencv():
     code = "import sys, tagjax.baselines; tagjax.baselines.host_trace; sys.exit('cv2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-@pytest.mark.parametrize("path", MODULES, ids=str)
-def test_public_names_are_documented(path):
-    tree = ast.parse(path.read_text())
-    assert ast.get_docstring(tree)
-    for node in tree.body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
-            assert ast.get_docstring(node), f"{path.name}: {node.name}"
-
-
 def test_tracers_are_abstract_or_final():
-    for module in (tagjax.tracer, tagjax.tagattention, tagjax.tagattention_paper):
+    for module in (tagjax.tracing.tracer, tagjax.tagattention, tagjax.tagattention.paper):
         for thing in vars(module).values():
             if isinstance(thing, type) and issubclass(thing, eqx.Module) and thing is not eqx.Module:
                 for base in thing.__bases__:
                     assert base is eqx.Module or base.__name__.startswith("Abstract"), thing
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "experiments").glob("*.py")), ids=str)
-def test_entry_points_are_thin(path):
-    assert len(path.read_text().splitlines()) < 80
+def test_entry_points_are_thin():
+    lengths = {path.name: len(path.read_text().splitlines()) for path in (ROOT / "experiments").glob("*.py")}
+    assert {name: length for name, length in lengths.items() if length >= 80} == {}

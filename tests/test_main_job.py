@@ -16,16 +16,19 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.config import ConfigError, EvaluateConfig, TrainConfig, VirtualTagSettings, from_mapping
-from tagjax.data.store import save_recording
-from tagjax.evaluation.run import run_evaluation
+from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.evaluation.run import EvaluateConfig, run_evaluation
 from tagjax.recording import RecordingError, TagReads
+from tagjax.recording.opening import VirtualTagSettings, with_virtual_tags
+from tagjax.recording.reads import join_reads
+from tagjax.recording.store import save_recording
 from tagjax.tagattention import TagAttention
-from tagjax.tagattention_paper import TagAttentionPaper
+from tagjax.tagattention.paper import TagAttentionPaper
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.training import run as run_module
+from tagjax.training.config import TrainConfig
 from tagjax.training.loop import Trained
-from tagjax.training.run import antennas_for, make_tracer, run_training
-from tagjax.training.sources import join_reads, with_virtual_tags
+from tagjax.training.run import antennas_for, run_training
 from tagjax.training.state import TrainState
 
 ROOT = Path(__file__).parents[1]
@@ -46,9 +49,9 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def _values(recordings: list[str]) -> dict:
     return {
         # Softened, the paper's tracer has parameters to learn, too; with it the test takes half as long.
-        "tracer": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
+        "tracer": {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},
-        "baselines": {"paper": {"_target_": "tagjax.tagattention_paper.TagAttentionPaper", "cell": 4}},
+        "baselines": {"paper": {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4}},
         "data": {
             "recordings": recordings[:1],
             "validation": recordings[1:],
@@ -118,9 +121,9 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
 
 def test_what_a_run_says_of_itself_is_not_given_again() -> None:
     for more in ({"tracer": {"_target_": "tagjax.tagattention.TagAttention"}}, {"weights": "default"}):
-        with pytest.raises(ConfigError, match="has a tracer and parameters of its own: leave out"):
+        with pytest.raises(ConfigError, match="expected one of them, because a run has its own tracer"):
             from_mapping(EvaluateConfig, {"run": "runs/1", **more})
-    with pytest.raises(ConfigError, match="checkpoint=3 is one of a run's"):
+    with pytest.raises(ConfigError, match="found checkpoint=3 without run"):
         from_mapping(EvaluateConfig, {"checkpoint": 3})
     with pytest.raises(ConfigError, match="clips: unknown key 'strid'"):
         from_mapping(EvaluateConfig, {"clips": {"strid": 3}})
@@ -185,7 +188,7 @@ def test_label_pictures_are_whole_and_of_the_frames_size(tmp_path: Path) -> None
     np.testing.assert_array_equal(labelled.truth.labels[:], recording.truth.labels[:])
 
     odd = dataclasses.replace(settings, reader={"foo": 1})
-    with pytest.raises(ConfigError, match=r"virtual_tag\.reader: unknown key 'foo'; known are region, num_tags"):
+    with pytest.raises(ConfigError, match=r"virtual_tag\.reader: unknown key 'foo'; known keys are region, num_tags"):
         with_virtual_tags(dataclasses.replace(recording, truth=None), odd)
 
     second = tmp_path / "00000001.png"

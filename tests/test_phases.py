@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
-from tagjax._numerics import log_i0
-from tagjax.phases import MAX_FRESH_READS, Fresh, PhaseNoise, Phasor, explain, fresh_reads
-from tagjax.rf.reads import PhaseReads
+from tagjax.core.numerics import log_i0
+from tagjax.radio.reads import PhaseReads
+from tagjax.tagattention.phases import MAX_FRESH_READS, Fresh, PhaseNoise, Phasor, explain, fresh_reads
 
 C = 299_792_458.0
 FRAME_S = 0.05

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import zarr
 
-from tagjax._types import LazyArray
-from tagjax.data import prepared
-from tagjax.data.prepared import made_once, write_rows
+from tagjax.core import prepared
+from tagjax.core.prepared import made_once, write_rows
+from tagjax.core.types import LazyArray
 
 SHAPE, SHARD, BLOCK = (11, 3, 2), 4, 2
 WHOLE = np.arange(66, dtype=np.int16).reshape(SHAPE)

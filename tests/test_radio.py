@@ -13,18 +13,18 @@ import pytest
 from radio_simulation import C, simulate_reads, smooth_path
 from scipy.interpolate import lagrange
 
+from tagjax.radio import refine, resample
+from tagjax.radio.channels import estimate_slope
+from tagjax.radio.coherence import coherence, phase_likelihood, phase_residual
+from tagjax.radio.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
+from tagjax.radio.noise import pi_flip_share, thermal_sigma_rad
+from tagjax.radio.phase import distance_to_phase, phase_to_distance
+from tagjax.radio.reads import PhaseReads
+from tagjax.radio.refine import interpolation_weights
+from tagjax.radio.unwrap import remove_jump, unwrap_paper
 from tagjax.recording import TagReads
-from tagjax.rf import refine, resample
-from tagjax.rf.channels import estimate_slope
-from tagjax.rf.coherence import coherence, phase_likelihood, phase_residual
-from tagjax.rf.grid_filter import RadioModel, _fourier, filter_reads, reference_carrier
-from tagjax.rf.noise import pi_flip_share, thermal_sigma_rad
-from tagjax.rf.phase import distance_to_phase, phase_to_distance
-from tagjax.rf.reads import PhaseReads
-from tagjax.rf.refine import interpolation_weights
-from tagjax.rf.rest import MIN_READS, coherence_lost
-from tagjax.rf.unwrap import remove_jump, unwrap_paper
-from tagjax.rf.windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
+from tagjax.tracing.motion_evidence import MIN_READS
+from tagjax.tracing.range_windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
 
 # Compiled whole: operation by operation they take several times as long to compile.
 refine_path = eqx.filter_jit(refine.refine_path)
@@ -553,7 +553,7 @@ def test_coherence_lost_by_rest_is_that_of_the_reads_modulo_pi() -> None:
         rssi_dbm=np.full(count, -50, np.float32),
         doppler_hz=np.full(count, np.nan, np.float32),
     )
-    lost = coherence_lost(reads, edges, 7_000_000_000)
+    lost = coherence_loss(reads, edges, 7_000_000_000)
     channel = np.unique(np.stack([reads.antenna, carrier_hz]), axis=1, return_inverse=True)[1]
     time_s = (reads.time_ns - 7_000_000_000) * 1e-9
     for piece, (begin, end) in enumerate(itertools.pairwise(edges)):
@@ -566,6 +566,6 @@ def test_coherence_lost_by_rest_is_that_of_the_reads_modulo_pi() -> None:
         assert lost[piece] == pytest.approx(1.0 - float(found) if piece < 3 else 0.0, abs=1e-5)
     # Flips lose nothing, noise of sigma rad about 2 sigma^2 and a wave of a hand nearly all.
     assert 0.15 < lost[2] < 2 * 0.4**2 + 0.02
-    assert not coherence_lost(TagReads.empty(), edges, 0).any()
+    assert not coherence_loss(TagReads.empty(), edges, 0).any()
     wave = dataclasses.replace(reads, phase_rad=np.mod(4 * np.pi * 0.15 * np.sin(2 * np.pi * time_s) / 0.33, 2 * np.pi))
-    assert coherence_lost(wave, edges, 7_000_000_000)[:3].min() > 0.6
+    assert coherence_loss(wave, edges, 7_000_000_000)[:3].min() > 0.6

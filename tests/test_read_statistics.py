@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import yaml
 
-from tagjax.config import from_mapping
+from tagjax.core.settings import from_mapping
+from tagjax.radio.reader import HOP_TABLES_HZ
 from tagjax.recording import Recording
-from tagjax.sim.reader import HOP_TABLES_HZ
 from tagjax.sim.record import simulate_recording
 from tagjax.sim.stories.scenario import Scenario
 from tagjax.sim.suites import Suite, item_scenario
@@ -23,7 +23,7 @@ from tagjax.sim.world.bodies import STEP_S, tag_path
 pytestmark = pytest.mark.ci
 
 C = 299_792_458.0
-FOLDER = Path(__file__).parents[1] / "conf" / "benchmark"
+FOLDER = Path(__file__).parents[1] / "conf" / "suite"
 STATIONARY_S = 20.0
 QUIET = {"outages_per_minute": 0.0}
 

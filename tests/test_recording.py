@@ -17,13 +17,14 @@ import pytest
 import synthetic_clips as synthetic
 import zarr
 
-from tagjax.data import flow_cache, store
-from tagjax.data.backwards import played_backwards
-from tagjax.data.clips import clip_dataset, load_clip
-from tagjax.data.flow_cache import pair_flow
-from tagjax.data.store import StoredFrames, open_recording, save_recording, write_recording
+from tagjax.flow import cache as flow_cache
+from tagjax.flow.cache import pair_flow
 from tagjax.flow.opencv import make_flow
-from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads, Truth
+from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads, Truth, store
+from tagjax.recording.backwards import played_backwards
+from tagjax.recording.store import StoredFrames, open_recording, save_recording, write_recording
+from tagjax.tracing.clips import load_clip
+from tagjax.training.clip_dataset import clip_dataset
 
 
 def _with_reads(recording: Recording, **columns) -> Recording:
@@ -635,8 +636,9 @@ def test_an_interrupted_flow_leaves_the_recording_usable(moving, monkeypatch, st
 
 _KILLED = """
 import os, signal, sys
-from tagjax.data import flow_cache, store
-from tagjax.data.store import open_recording
+from tagjax.flow import cache as flow_cache
+from tagjax.recording import store
+from tagjax.recording.store import open_recording
 
 def slow(name):
     count = []

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import scipy.io
 
-from tagjax.config import ConfigError, from_mapping
-from tagjax.data.importers.registration import estimate_correction, misalignment_px
-from tagjax.data.importers.rgbd_folder import DepthToColour, load_calibration, read_mat_depth
-from tagjax.data.importers.settings import ImportSettings, import_recording
-from tagjax.data.picture_files import read_colour
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.recording import Intrinsics, RecordingError
+from tagjax.recording.importers.registration import estimate_correction, misalignment_px
+from tagjax.recording.importers.rgbd_folder import DepthToColour, load_calibration, read_mat_depth
+from tagjax.recording.importers.settings import ImportSettings, import_recording
+from tagjax.recording.picture_files import read_colour
 
 RESIDUAL = (-0.006, 0.004, 0.002, 1.004, 0.99, 8.5, -3.0)
 
@@ -241,5 +241,5 @@ def test_a_real_residual_is_mended_in_held_out_frames(real_data, name, step) -> 
 
 
 def test_an_unknown_key_of_the_virtual_reader_is_told_before_anything_is_read():
-    with pytest.raises(ConfigError, match="reader: unknown key 'foo'; known are region, num_tags"):
+    with pytest.raises(ConfigError, match="reader: unknown key 'foo'; known keys are region, num_tags"):
         from_mapping(ImportSettings, {"video": "gone", "reader": {"foo": 1}})

@@ -18,9 +18,9 @@ import psutil
 import pytest
 import synthetic_clips as synthetic
 
-from tagjax.data.clips import clip_dataset
-from tagjax.data.store import save_recording
-from tagjax.data.stream import _begin_worker
+from tagjax.core.stream import _begin_worker
+from tagjax.recording.store import save_recording
+from tagjax.training.clip_dataset import clip_dataset
 
 ROOT = Path(__file__).parents[1]
 NUM_STEPS = 16

@@ -8,18 +8,10 @@ import numpy as np
 import pytest
 import scipy.io
 
-from tagjax.data.importers.rgbd_folder import (
-    TUM_INTRINSICS,
-    import_jpg_mat,
-    import_tum,
-    load_calibration,
-    read_colour,
-    read_labels,
-    read_mat_depth,
-)
-from tagjax.data.store import open_recording, save_recording
-from tagjax.geometry import undistort
+from tagjax.core.geometry import undistort
 from tagjax.recording import Intrinsics, RecordingError
+from tagjax.recording.importers.rgbd_folder import TUM_INTRINSICS, import_jpg_mat, import_tum, load_calibration, read_colour, read_labels, read_mat_depth
+from tagjax.recording.store import open_recording, save_recording
 
 HEIGHT, WIDTH = 48, 64
 CAMERA = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])

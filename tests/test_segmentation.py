@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.cluster.vq import kmeans2
 
-from tagjax import segmentation
+from tagjax.tagattention import segmentation
 
 # Compiled as a whole: as single operations most of the time would go into compiling each.
 segment = jax.jit(segmentation.segment, static_argnames=("cell", "num_iterations"))

@@ -9,14 +9,7 @@ from tagjax.sim.world import trajectory, walks
 from tagjax.sim.world.bodies import STEP_S, World, rotation_matrix
 from tagjax.sim.world.crowd import BODY_RADIUS_M, distance_to
 from tagjax.sim.world.objects import OBJECT_KINDS, bounds, make_object
-from tagjax.sim.world.people import (
-    Hands,
-    carried_poses,
-    hand_target,
-    limb_bodies,
-    make_person,
-    move_person,
-)
+from tagjax.sim.world.people import Hands, carried_poses, hand_target, limb_bodies, make_person, move_person
 from tagjax.sim.world.rooms import ROOMS, make_room
 from tagjax.sim.world.rotation import frame, multiply, quaternion_of, turn_about
 

@@ -53,6 +53,6 @@ def test_the_simulator_imports_without_mujoco():
         "sys.modules['mujoco'] = None\n"
         "sys.modules['matplotlib'] = None\n"
         "import tagjax.sim.flow_pairs, tagjax.sim.stories, tagjax.sim.suites\n"
-        "import tagjax.sim.rendering.textures, tagjax.training.sources\n"
+        "import tagjax.sim.rendering.textures\n"
     )
     subprocess.run([sys.executable, "-c", blocked], check=True)

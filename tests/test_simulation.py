@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
+from tagjax.radio.noise import pi_flip_share
+from tagjax.radio.reader import DWELL_S, ReaderSettings, ReaderState, channel_at, noise_sigma_rad, read_times
 from tagjax.recording import RecordingError
-from tagjax.rf.noise import pi_flip_share
-from tagjax.rf.windows import phase_reads, radio_windows
-from tagjax.sim.reader import DWELL_S, ReaderSettings, ReaderState, channel_at, noise_sigma_rad, read_times
-from tagjax.sim.virtual_tag import Track, attach_virtual_tags, load_tracks_csv, virtual_reads
+from tagjax.recording.virtual_tags import Track, attach_virtual_tags, load_tracks_csv, virtual_reads
+from tagjax.tracing.range_windows import phase_reads, radio_windows
 
 STILL = Track(np.linspace(0, 60, 61), np.tile([0.2, 0.1, 2.0], (61, 1)))
 

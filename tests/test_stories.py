@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tagjax.radio.coherence import coherence, phase_residual
 from tagjax.recording import Recording
-from tagjax.rf.coherence import coherence, phase_residual
 from tagjax.sim.record import CaptureSettings, simulate_recording
 from tagjax.sim.rendering.raycast import Raycaster
 from tagjax.sim.rendering.sensors import kinect_v2_intrinsics

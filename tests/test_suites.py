@@ -1,4 +1,4 @@
-"""Suites: every file under conf/benchmark is one, splits are apart, and runs resume and repeat exactly."""
+"""Suites: every file under conf/suite is one, splits are apart, and runs resume and repeat exactly."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import yaml
 
-from tagjax.config import ConfigError, from_mapping
-from tagjax.data.store import open_recording
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.recording import RecordingError
+from tagjax.recording.store import open_recording
 from tagjax.sim.contact_sheet import save_sheet
 from tagjax.sim.radio.planar import PlanarSettings, open_planar, planar_trials
 from tagjax.sim.record import simulate_recording
@@ -29,7 +29,7 @@ from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, 
 from tagjax.sim.world.bodies import STEP_S, tag_dipole, tag_path
 from tagjax.sim.world.objects import bounds
 
-FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
+FILES = sorted((Path(__file__).parents[1] / "conf" / "suite").glob("*.yaml"))
 
 
 def _suite(path: Path) -> Suite:

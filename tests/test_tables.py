@@ -7,10 +7,10 @@ import warnings
 import numpy as np
 import pytest
 
-from tagjax.data.importers.clock import audit_clocks, reader_epoch, to_host_ns
-from tagjax.data.importers.formats import FORMATS, clean_epc, recognise, stamp_ns
-from tagjax.data.importers.tables import import_table
 from tagjax.recording import RecordingError, RecordingWarning
+from tagjax.recording.importers.clock import audit_clocks, reader_epoch, to_host_ns
+from tagjax.recording.importers.formats import FORMATS, clean_epc, recognise, stamp_ns
+from tagjax.recording.importers.tables import import_table
 
 EPC = "E2801191A503006543210ABC"
 HOUR = 1_700_000_000

@@ -13,33 +13,7 @@ import numpy as np
 import pytest
 
 from tagjax.baselines import HostCamera, HostFrame, host_trace
-from tagjax.baselines.tagview import (
-    AbstractDetector,
-    BoxDetector,
-    BoxNetwork,
-    BoxTracks,
-    DetectorSettings,
-    LabelledFrame,
-    MatchSettings,
-    MotionDetector,
-    SortSettings,
-    TagviewSettings,
-    TagviewTracer,
-    TrainSettings,
-    detection_loss,
-    from_inclusive,
-    labelled_frames,
-    load_detector,
-    make_detector,
-    measure_detector,
-    middle_px,
-    overlap,
-    save_detector,
-    suppress,
-    track_boxes,
-    train_detector,
-    undistorted,
-)
+from tagjax.baselines.tagview import AbstractDetector, BoxDetector, BoxNetwork, BoxTracks, DetectorSettings, LabelledFrame, MatchSettings, MotionDetector, SortSettings, TagviewSettings, TagviewTracer, TrainSettings, detection_loss, from_inclusive, labelled_frames, load_detector, make_detector, measure_detector, middle_px, overlap, save_detector, suppress, track_boxes, train_detector, undistorted
 from tagjax.baselines.tagview._anchors import decode, default_boxes, encode, targets
 from tagjax.evaluation.tagview import Matching, TagviewExperiment, run_tagview, table, true_stretches, watch
 from tagjax.evaluation.tagview._judge import owners
@@ -371,14 +345,14 @@ def test_the_tracer_finds_names_and_places_every_tag():
     recording = _recording()
     said = [trace for _, trace in host_trace(_tracer(), recording, epcs=["B", "A"])]
     last = said[-1]
-    assert np.asarray(last.found).all()
+    assert np.asarray(last.detected).all()
     assert recording.truth is not None
     boxes = np.asarray(recording.truth.boxes_px)[-1][[1, 0]]
     np.testing.assert_allclose(last.box_px, boxes, atol=1.0)
     true_m = [recording.truth.tag_position_m[epc][-1] for epc in ("B", "A")]
     np.testing.assert_allclose(last.centre_m, true_m, atol=0.08)
     assert np.all(np.asarray(last.confidence) > 0.95)
-    assert not np.asarray(said[0].found).any()
+    assert not np.asarray(said[0].detected).any()
     ranges = [np.linalg.norm(recording.truth.tag_position_m["A"][i] - recording.antennas_m[0]) for i in (-2, -1)]
     assert float(last.step_m[1, 0]) == pytest.approx(ranges[1] - ranges[0], abs=0.012)
 
@@ -394,7 +368,7 @@ def test_a_known_height_places_tags_whatever_the_slope_says():
     for height_m in (None, HEIGHT_M):
         settings = dataclasses.replace(_tracer().settings, height_m=height_m)
         *_, (_, last) = host_trace(TagviewTracer(settings, detector=Perfect()), recording, epcs=["B", "A"])
-        assert np.asarray(last.found).all()
+        assert np.asarray(last.detected).all()
         place_m[height_m] = np.asarray(last.centre_m)
     assert np.all(place_m[None][:, 2] > 1.1 * HEIGHT_M)
     np.testing.assert_allclose(place_m[HEIGHT_M], true_m, atol=0.03)
@@ -431,11 +405,11 @@ def test_where_tagview_does_not_apply():
 def test_more_tags_than_things_and_nothing_in_sight():
     recording = _recording()
     alone = dataclasses.replace(recording, colour=np.full_like(np.asarray(recording.colour), 50))
-    assert not any(np.asarray(trace.found).any() for _, trace in host_trace(_tracer(), alone))
+    assert not any(np.asarray(trace.detected).any() for _, trace in host_trace(_tracer(), alone))
     one = _recording(1)
     both = one.with_reads(recording.reads)
     *_, (_, last) = host_trace(_tracer(), both)
-    np.testing.assert_array_equal(np.asarray(last.found), [True, False])
+    np.testing.assert_array_equal(np.asarray(last.detected), [True, False])
 
 
 def test_a_thing_that_was_hidden_is_named_again():
@@ -482,7 +456,7 @@ def test_a_run_writes_its_report(tmp_path, monkeypatch):
     monkeypatch.setattr("tagjax.baselines.tagview._tracer.make_detector", lambda settings: Perfect())
     match = MatchSettings(origin="antenna", least_spread=0.1)
     config = TagviewExperiment(
-        recordings=str(tmp_path / "rec"),
+        recordings_dir=str(tmp_path / "rec"),
         suites=("ceiling_2",),
         matching={"tagview": Matching(match), "alone": Matching(dataclasses.replace(match, programme=False))},
     )
@@ -497,7 +471,7 @@ def test_a_run_writes_its_report(tmp_path, monkeypatch):
         assert (tmp_path / "out" / name).stat().st_size > 0
     with pytest.raises(ValueError, match="no recording"):
         run_tagview(dataclasses.replace(config, suites=("ceiling_9",)), tmp_path / "none")
-    with pytest.raises(ValueError, match="whole"):
+    with pytest.raises(ValueError, match="complete"):
         TagviewExperiment(suites=("a",), matching={})
 
 

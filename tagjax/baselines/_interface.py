@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
 from ..recording import Intrinsics, Recording, RecordingError, TagReads
-from ..tracer import Trace
+from ..tracing.tracer import Trace
 
 
 @dataclasses.dataclass(frozen=True)

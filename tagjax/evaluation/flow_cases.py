@@ -11,11 +11,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from ..data.flo import read_flo
-from ..data.picture_pairs import open_sequence
-from ..data.store import open_recording
+from ..flow.flo_files import read_flo
+from ..flow.picture_pairs import open_sequence
 from ..flow.pictures import check_pictures
 from ..recording import RecordingError
+from ..recording.store import open_recording
 from ..sim.flow_pairs import FlowPairSettings, flow_pairs
 
 _BATCH = 8

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 
-from ..arrays_file import ArraysFile, named_arrays
+from ..core.arrays_file import ArraysFile, named_arrays
 from .network import AbstractFlowNetwork
 
 PACKAGED = Path(__file__).parent / "weights"

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ..data.store import open_recording
 from ..recording import Recording, RecordingError
+from ..recording.store import open_recording
 from .radio.planar import PlanarTrials, open_planar
 from .suites import PLANAR, Item, Suite, make_suite
 

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..data.importers.clock import audit_clocks, to_host_ns
 from ..recording import ClockAudit, Intrinsics, Recording, TagReads, Truth
+from ..recording.importers.clock import audit_clocks, to_host_ns
+from ..recording.virtual_tags import Track
 from .radio.environment import room_environment
 from .radio.inventory import simulate_inventory
 from .rendering.exact_flow import flow_between
@@ -21,7 +22,6 @@ from .rendering.sensors import SENSORS, frame_times, kinect_v2_intrinsics, xtion
 from .rendering.viewpoint import Viewpoint, look_at
 from .rendering.visibility import sampled_steps
 from .stories.scenario import Scenario
-from .virtual_tag import Track
 from .world.bodies import STEP_S, World, tag_dipole, tag_path
 from .world.sightline import line_of_sight
 

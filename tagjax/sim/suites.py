@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from ..data.store import save_recording
 from ..recording import RecordingError
+from ..recording.store import save_recording
 from .radio.inventory import InventorySettings
 from .radio.planar import PlanarSettings, planar_trials, save_planar
 from .record import CaptureSettings, simulate_recording
@@ -304,3 +304,19 @@ def make_items(
 
     make_suite(suite, folder, workers=workers, on_done=on_done, wanted=wanted)
     return [item for item in suite.items() if wanted(item)]
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulateConfig:
+    """The suite that is simulated (settings of `tagjax.sim.suites.Suite`), and the folder for its recordings."""
+
+    suite: Mapping[str, Any]
+    recordings_dir: str = "recordings"
+    smoke: bool = False
+    workers: int | None = None  # processes; as many as there are cores if None
+    progress: bool = True
+    sheet: str | None = None  # a folder for a contact sheet; no recordings are then made
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ConfigError(f"workers is {self.workers}; expected at least 1 process.")

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..attention import att_corr, att_rbf, attention, coherent_score, read_support
-from ..phase_memory import PhaseMemory, phase_evidence
-from ..phases import PhaseNoise
-from ..propagation import log_likelihood_ratio, radio_speed, velocity_gate
-from ..rf.reads import PhaseReads, RadioWindow
-from ..segmentation import unpool
-from ..view import Ranging, View, of_each_antenna
+from ..radio.reads import PhaseReads, RadioWindow
 from ._fields import AbstractTagAttention
+from .attention import att_corr, att_rbf, attention, coherent_score, read_support
+from .phase_memory import PhaseMemory, phase_evidence
+from .phases import PhaseNoise
+from .propagation import log_likelihood_ratio, radio_speed, velocity_gate
+from .segmentation import unpool
+from .view import Ranging, View, of_each_antenna
 
 
 class AbstractEvidence(AbstractTagAttention):

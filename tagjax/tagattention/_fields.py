@@ -7,7 +7,7 @@ from typing import Literal
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..tracer import AbstractSmoother
+from ..tracing.tracer import AbstractSmoother
 
 
 class AbstractTagAttention(AbstractSmoother):

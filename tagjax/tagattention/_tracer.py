@@ -17,7 +17,15 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from ..parameters import check_positive, check_shares, check_whole, physical, stored_log, stored_logit, with_physical
+from ..core.parameters import (
+    check_positive,
+    check_shares,
+    check_whole,
+    physical,
+    stored_log,
+    stored_logit,
+    with_physical,
+)
 from ._stages import AbstractStages
 
 
@@ -130,7 +138,7 @@ class TagAttention(AbstractStages):
             noise_share: share of the radio's variance that widens the kernel.
             rest: how much a pixel at rest counts as explained by the background; 0 in the paper.
             coherent_weight, coherent_level: weight of the coherent phase term, and the score that speaks for neither.
-            phase_weight: weight of the phase evidence (`tagjax.phases`), whose reads count once each.
+            phase_weight: weight of the phase evidence (`tagjax.tagattention.phases`), whose reads count once each.
             phase_spread_rad, phase_rest_spread_rad: standard deviation of phases that a pixel's motion explains, and of
                 those of a tag at rest, beside thermal noise.
             phase_slack, phase_outlier: share of the motion by which reflections bend phases; share of reads that say
@@ -155,7 +163,7 @@ class TagAttention(AbstractStages):
                 share of it that counts as evidence of the pixel's identity.
             anchor_drift_m: error of the radio's distance that adds up, per frame.
             foreground_weight: pull of what stands before the background.
-            fate_weight: share of the evidence of common fate in space (`tagjax.common_fate`) that counts, a frame.
+            fate_weight: share of the evidence of common fate in space (`tagjax.tagattention.common_fate`) that counts, a frame.
             fate_spread_m, fate_slack: how far apart parts of one thing may come over the window, m, and as a share of its
                 own way.
             rivalry: log odds that a pixel of another tag's object counts less, at most; infinite where a thing has one tag.

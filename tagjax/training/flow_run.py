@@ -15,19 +15,20 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ..config import TrainFlowConfig, build
-from ..data.picture_pairs import VariationSettings, open_sequence
-from ..evaluation.benchmark import machine
-from ..evaluation.flow_metrics import FlowScores
-from ..evaluation.report import write_json
+from ..core.build import build
+from ..core.machine import machine
 from ..flow.estimates import NetworkFlow, one_way
 from ..flow.losses import FlowLossSettings
 from ..flow.named import make_flow
 from ..flow.network import AbstractFlowNetwork
+from ..flow.picture_pairs import VariationSettings, open_sequence
 from ..flow.weights import load_weights, save_weights
+from ..metrics.flow import FlowScores
+from ..report.report import write_json
 from ..sim.flow_pairs import FlowPair
 from .checkpoint import Checkpoints
 from .devices import check_batch, local
+from .flow_config import TrainFlowConfig
 from .flow_sources import flow_dataset, installed_photographs, validation_pairs
 from .flow_step import FlowTrainState, flow_step
 from .logging import Logger

@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
-from .._compile import large_program
+from ..core.compilation import large_program
 from ..flow.losses import (
     FlowLossSettings,
     imitation_term,

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from .._types import LazyArray
-from ..data.prepared import made_once, write_rows
+from ..core.prepared import made_once, write_rows
+from ..core.types import LazyArray
 from ..flow.named import flow_key, make_flow
 from ..recording import RecordingError
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
+from ..core.settings import ConfigError
 from ..flow.estimates import padding
 from ..flow.losses import FlowLossSettings, weighted
 from ..flow.network import AbstractFlowNetwork, flow_both_ways
 from ..flow.stillness import has_moved
 from ..flow.weights import save_weights
-from ..tracer import AbstractTracer, Frame
+from ..tracing.tracer import AbstractTracer, Frame
 from .flow_step import terms_both_ways
 
 
@@ -99,3 +101,23 @@ def _stride(frames: Frame) -> int:
 def save_network(path: Path, model: JointModel, settings: Mapping[str, Any]) -> None:
     """Write the model's flow network, which `settings` build, as weights that flows are named by (`make_flow`)."""
     save_weights(path, model.network, {"flow": dict(settings), "learned_with": type(model.tracer).__name__})
+
+
+@dataclasses.dataclass(frozen=True)
+class JointSettings:
+    """A flow network that is learned with the tracer."""
+
+    flow: Mapping[str, Any]
+    optimizer: Mapping[str, Any]
+    init: str | None = "default"  # weights to begin with: `default` or a file; random ones if None
+    clip_norm: float = 1.0
+    weight: float = 1.0  # of the network's own loss beside the tracer's objective
+    loss: FlowLossSettings = dataclasses.field(default_factory=lambda: FlowLossSettings(occlusion_after=0))
+
+    def __post_init__(self) -> None:
+        if self.weight < 0:
+            raise ConfigError(f"weight is {self.weight}; expected 0 or more.")
+        if self.loss.self_supervision > 0:
+            raise ConfigError(
+                "loss.self_supervision is above 0, which only experiments.train_flow supports; expected 0."
+            )

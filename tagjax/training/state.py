@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PyTree, UInt32
 
-from ..tracer import AbstractTracer
+from ..tracing.tracer import AbstractTracer
 from .joint import JointModel
 
 

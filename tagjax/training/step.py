@@ -19,8 +19,8 @@ import optax
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from .._compile import large_program
-from ..tracer import AbstractTracer, Camera, Frame
+from ..core.compilation import large_program
+from ..tracing.tracer import AbstractTracer, Camera, Frame
 from .devices import AXIS, copied_here, mesh_here, spread_here
 from .joint import Flow, JointModel, network_flow
 from .loss import ObjectiveSettings, objective

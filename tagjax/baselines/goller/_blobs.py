@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 
-from ...geometry import pixel_rays
+from ...core.geometry import pixel_rays
 from ...recording import Intrinsics
 from ._site import Site
 

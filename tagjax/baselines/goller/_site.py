@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from ...geometry import backproject
+from ...core.geometry import backproject
 from ...recording import Intrinsics, Recording, RecordingError
 
 _TOLERANCE_M = 0.03

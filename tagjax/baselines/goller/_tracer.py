@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ...recording import Recording
-from ...tracer import Trace
+from ...tracing.tracer import Trace
 from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace
 from ._association import AssociationModel, HeldState, assignment_row, forward_start, forward_step
 from ._blobs import Blob, BlobTracker, in_slots

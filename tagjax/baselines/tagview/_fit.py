@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._numerics import safe_divide
+from ...core.numerics import safe_divide
 
 
 class LineFit(eqx.Module):

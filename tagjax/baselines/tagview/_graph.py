@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ...association import hard_assignment
+from ...core.assignment import hard_assignment
 
 Spread = Literal["std", "mad"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..._numerics import safe_divide
+from ...core.numerics import safe_divide
 
 
 def interpolate(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._numerics import wrap_to_pi
+from ...core.numerics import wrap_to_pi
 
 
 def splice_phase(

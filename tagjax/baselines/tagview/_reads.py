@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from ..._numerics import SPEED_OF_LIGHT_M_S
+from ...core.numerics import SPEED_OF_LIGHT_M_S
+from ...radio.channels import MAX_SLOPE_RAD_HZ, estimate_slope
+from ...radio.noise import pi_flip_share
 from ...recording import TagReads
-from ...rf.channels import MAX_SLOPE_RAD_HZ, estimate_slope
-from ...rf.noise import pi_flip_share
 from ._hermite import interpolate
 from ._phase import pieces, splice_phase
 

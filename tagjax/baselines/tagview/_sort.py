@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from ...association import hard_assignment
+from ...core.assignment import hard_assignment
 from ._boxes import overlap
 
 

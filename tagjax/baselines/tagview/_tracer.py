@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from ...recording import Intrinsics, Recording, TagReads
-from ...tracer import Trace
+from ...tracing.tracer import Trace
 from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace, joined_reads
 from ._boxes import middle_px
 from ._detect import AbstractDetector, DetectorSettings, make_detector

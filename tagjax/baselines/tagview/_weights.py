@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from ...arrays_file import ArraysFile
+from ...core.arrays_file import ArraysFile
 from ._network import BoxNetwork
 
 _WIDEST, _DEEPEST = 1024, 32

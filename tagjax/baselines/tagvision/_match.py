@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...association import hard_assignment
+from ...core.assignment import hard_assignment
 from ...recording import TagReads
 from ._score import PHASE_NOISE_RAD, Reference, Snapshots, match_scores
 from ._snapshots import Pairing, heading, hop_slope, pair_interpolated, pair_nearest, unsigned_phase

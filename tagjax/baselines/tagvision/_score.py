@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ..._numerics import safe_divide, safe_norm, safe_sqrt, wrap_to_pi
-from ...rf.phase import distance_to_phase
+from ...core.numerics import safe_divide, safe_norm, safe_sqrt, wrap_to_pi
+from ...radio.phase import distance_to_phase
 
 Reference = Literal["first", "absolute"]
 

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from ...radio.channels import MAX_SLOPE_RAD_HZ, estimate_slope
 from ...recording import TagReads
-from ...rf.channels import MAX_SLOPE_RAD_HZ, estimate_slope
 
 Pairing = Literal["nearest", "interpolate"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ...recording import Recording, TagReads
-from ...tracer import Trace
+from ...tracing.tracer import Trace
 from .._interface import AbstractHostTracer, Claim, HostCamera, HostFrame, claims_to_trace, joined_reads
 from ._blobs import BlobSettings, backward_flow, find_blobs
 from ._match import NO_MATCH, Match, MatchSettings, match_tags

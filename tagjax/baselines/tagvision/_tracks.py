@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from ...association import hard_assignment
+from ...core.assignment import hard_assignment
 from ._blobs import Blob, filled
 
 _BINS = 512  # 8 a channel

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Shaped, UInt8
 from matplotlib.axes import Axes
 
 from ...baselines.goller import AntennaModel, GridStatistic, Roc, response_db
-from ...viz.figure import blank
+from ...report.figure import blank
 from ._handover import Handover, mean_curve
 from ._tables import PAPER_TABLE_1
 

@@ -10,7 +10,7 @@ from jaxtyping import Shaped
 from matplotlib.axes import Axes
 
 from ...baselines.tagview import middle_px
-from ...viz.figure import blank
+from ...report.figure import blank
 from ._judge import Judged, Watched
 
 PAPER_ACCURACY = {2: 0.99, 6: 0.96}

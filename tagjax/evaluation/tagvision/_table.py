@@ -103,7 +103,7 @@ def see(
         state, said = tracer.step(setup, state, frame)
         world = camera.to_world(np.asarray(said.centre_m, np.float64))
         for tag, epc in enumerate(epcs):
-            claimed[epc].append(world[tag] if bool(said.found[tag]) else missing)
+            claimed[epc].append(world[tag] if bool(said.detected[tag]) else missing)
         if on_frame is not None:
             on_frame()
     time_s, paths = state.paths()

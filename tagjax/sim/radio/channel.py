@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from ..._numerics import SPEED_OF_LIGHT_M_S, safe_atan2, safe_divide, safe_norm, safe_sqrt, wrap_to_pi
-from ..reader import RSSI_AT_1M_DBM
+from ...core.numerics import SPEED_OF_LIGHT_M_S, safe_atan2, safe_divide, safe_norm, safe_sqrt, wrap_to_pi
+from ...radio.reader import RSSI_AT_1M_DBM
 from .environment import Environment, Planes, Scatterers
 
 MIN_DISTANCE_M = 0.05

@@ -12,9 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._numerics import SPEED_OF_LIGHT_M_S
-from ...recording import TagReads
-from ..reader import (
+from ...core.numerics import SPEED_OF_LIGHT_M_S
+from ...radio.reader import (
     DOPPLER_STD_HZ,
     DWELL_S,
     RSSI_AT_1M_DBM,
@@ -25,7 +24,8 @@ from ..reader import (
     quantise_phase,
     quantise_rssi,
 )
-from ..virtual_tag import Track
+from ...recording import TagReads
+from ...recording.virtual_tags import Track
 from ..world.rotation import unit
 from .environment import Environment
 from .links import SetUp

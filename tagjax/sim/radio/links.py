@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..reader import ReaderSettings, ReaderState, channel_at
-from ..virtual_tag import Track
+from ...radio.reader import ReaderSettings, ReaderState, channel_at
+from ...recording.virtual_tags import Track
 from ..world.rotation import unit
 from .channel import one_way_gain, reported_phase_rad, rssi_from_gain_dbm, two_way_gain
 from .environment import Environment

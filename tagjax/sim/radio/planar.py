@@ -10,7 +10,7 @@ import numpy as np
 import zarr
 from jaxtyping import Float
 
-from ..._numerics import SPEED_OF_LIGHT_M_S
+from ...core.numerics import SPEED_OF_LIGHT_M_S
 from ...recording import RecordingError
 
 FORMAT = "tagjax-planar"

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..reader import ROUND_BASE_S, ROUND_JITTER, ROUND_PER_TAG_S
+from ...radio.reader import ROUND_BASE_S, ROUND_JITTER, ROUND_PER_TAG_S
 
 ROUNDS_PER_ANTENNA = 4
 """Rounds before the reader switches antennas. Logs of 4 antennas show 0.03 to 0.24 s on one: 1 to 10 rounds of one tag."""

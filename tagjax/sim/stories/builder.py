@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ...recording.virtual_tags import default_epc
 from ..radio.inventory import InventorySettings
-from ..virtual_tag import default_epc
 from ..world.bodies import Body, Poses, Tag, World
 from ..world.crowd import is_free
 from ..world.figure import PersonModel

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 
 from jaxtyping import Array, Float
 
-from ...tracer import AbstractTracer, Camera, Frame
+from ...tracing.tracer import AbstractTracer, Camera, Frame
 from ._masks import area, compactness, coverage, future_agreement, steadiness
 from ._reads import Agreement, agreement, calibration, contrast, distance_at
 from ._seen import TERM_NAMES, ObjectiveSettings, Seen, clip_reads, see

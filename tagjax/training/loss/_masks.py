@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._numerics import safe_divide
+from ...core.numerics import safe_divide
 from ...image.warp import gather
-from ...tracer import Frame
+from ...tracing.tracer import Camera, Frame
 from ._seen import ObjectiveSettings, Seen
 
 

@@ -1,0 +1,1 @@
+"""Numerics, compilation, constrained parameters, camera geometry and files: what every other package builds on."""

@@ -1,0 +1,62 @@
+"""The pinhole camera."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import numbers
+from typing import Any
+
+import numpy as np
+
+from .errors import RecordingError
+
+_LENSES = (0, 4, 5, 8, 12, 14)
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(float(value))
+
+
+@dataclasses.dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera: focal lengths and principal point in pixels; distortion in OpenCV's order (k1 k2 p1 p2 k3)."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+
+    def scaled(self, stride: int) -> Intrinsics:
+        """Intrinsics of every `stride`-th pixel, the first kept: pixel i of the result is pixel i * stride."""
+        return dataclasses.replace(
+            self,
+            fx_px=self.fx_px / stride,
+            fy_px=self.fy_px / stride,
+            cx_px=self.cx_px / stride,
+            cy_px=self.cy_px / stride,
+            width=-(-self.width // stride),
+            height=-(-self.height // stride),
+        )
+
+    def matrix(self) -> np.ndarray:
+        """The 3x3 camera matrix."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]], dtype=np.float64)
+
+    def check(self) -> None:
+        """Raise `RecordingError` for what no camera has."""
+        if not all(isinstance(side, numbers.Integral) and side > 0 for side in (self.width, self.height)):
+            raise RecordingError(f"Intrinsics: {self.width} x {self.height}; expected a picture's size, whole pixels.")
+        for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
+            value = getattr(self, name)
+            if not _finite(value) or (name in ("fx_px", "fy_px") and value <= 0):
+                kind = "positive" if name in ("fx_px", "fy_px") else "finite"
+                raise RecordingError(f"Intrinsics: {name} is {value!r}; expected a {kind} number of pixels.")
+        if len(self.distortion) not in _LENSES or not all(map(_finite, self.distortion)):
+            raise RecordingError(
+                f"Intrinsics: distortion is {self.distortion!r}; expected finite k1 k2 p1 p2 k3, as many as OpenCV takes "
+                f"({', '.join(map(str, _LENSES))})."
+            )

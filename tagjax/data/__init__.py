@@ -1,1 +1,0 @@
-"""Recordings on disk, clips, and importers."""

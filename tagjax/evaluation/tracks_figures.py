@@ -1,0 +1,62 @@
+"""Accuracy of association scores against the length of the window that they see. Needs the viz extra."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..report.figure import blank
+
+if TYPE_CHECKING:
+    from .real_tags import Association
+
+
+def accuracy_plot(path: Path, rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> None:
+    """A panel for each scene, a line for each method; `rows` are those of `evaluation.tracks.run_tracks`."""
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    figure = blank(4.2 * max(len(names), 1), 3.4)
+    for axes, name in zip(np.atleast_1d(figure.subplots(1, max(len(names), 1), sharey=True)), names, strict=False):
+        mine = [row for row in rows if row["scene"] == name]
+        length = [row["window_s"] for row in mine]
+        for method in methods:
+            axes.plot(length, [row["accuracy"][method] for row in mine], "o-", label=method, markersize=4)
+        axes.plot(length, [row["chance"] for row in mine], "k:", label="chance")
+        axes.set(
+            xlabel="window (s)", ylim=(0, 1.03), xscale="log", xticks=length, xticklabels=[f"{s:g}" for s in length]
+        )
+        axes.set_title(name, fontsize=9)
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    if names:
+        figure.axes[0].set_ylabel("carrier has the highest score")
+        figure.axes[0].legend(fontsize=7, loc="lower right")
+    figure.savefig(path, dpi=110)
+
+
+def speeds_plot(path: Path, found: Sequence[Association]) -> None:
+    """A panel for each recording: the tag's speed, to the scale of its carrier's, and the own tracks' towards the antenna."""
+    figure = blank(11.0, 2.4 * max(len(found), 1))
+    for axes, one in zip(np.atleast_1d(figure.subplots(max(len(found), 1), 1)), found, strict=False):
+        carrier = one.found[one.carrier]
+        for number, (walk, each) in enumerate(zip(one.tagged.walks, one.found, strict=False)):
+            label = f"track {walk.name[-4:]}, correlation {each.correlation:.2f}"
+            style = "-" if number == one.carrier else ":"
+            axes.plot(walk.time_s, walk.towards_m_s(each.antenna_m), style, label=label, linewidth=1.2)
+        heard = one.heard_m_s() / (carrier.slope or 1.0)
+        axes.plot(
+            one.tagged.walks[one.carrier].time_s,
+            heard,
+            "k.",
+            markersize=2.5,
+            label=f"tag, measured speed / {carrier.slope:.2f}",
+        )
+        axes.set_title(f"{one.tagged.name}: clocks {carrier.lag_s:.1f} s apart", fontsize=9, loc="left")
+        axes.set_ylabel("towards antenna (m/s)", fontsize=8)
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3)
+    if found:
+        figure.axes[-1].set_xlabel("time (s)")
+    figure.savefig(path, dpi=110)

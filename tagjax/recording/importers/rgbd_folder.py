@@ -1,0 +1,273 @@
+"""RGB-D folders: NNN.jpg beside NNN.mat with a calibration, and TUM RGB-D. Frames are decoded when they are asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.io
+
+from ...core.camera import Intrinsics
+from ...core.errors import RecordingError
+from ...core.geometry import register_depth, undistort
+from ..picture_files import in_order, read_colour, read_labels, read_picture
+from ..reads import TagReads
+from ..recording import Recording, Truth
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthToColour:
+    """A depth camera beside a colour camera: X_colour = rotation X_depth + translation."""
+
+    depth_camera: Intrinsics
+    colour_camera: Intrinsics
+    rotation: np.ndarray
+    translation_m: np.ndarray
+
+    def corrected(self, correction: Sequence[float]) -> DepthToColour:
+        """With a residual correction: (dTx, dTy, dTz) metres, factors on fx and fy, shifts of cx and cy in pixels."""
+        dx, dy, dz, scale_x, scale_y, shift_x, shift_y = correction
+        camera = self.colour_camera
+        return dataclasses.replace(
+            self,
+            translation_m=self.translation_m + np.array([dx, dy, dz]),
+            colour_camera=dataclasses.replace(
+                camera,
+                fx_px=camera.fx_px * scale_x,
+                fy_px=camera.fy_px * scale_y,
+                cx_px=camera.cx_px + shift_x,
+                cy_px=camera.cy_px + shift_y,
+            ),
+        )
+
+
+class FrameFiles:
+    """Frames that are files, decoded by `decode(path)` when indexed: what Recording asks of an array."""
+
+    def __init__(self, files: Sequence[Path], decode: Callable[[Path], np.ndarray], shape: tuple[int, ...], dtype: Any):
+        self._files, self._decode = list(files), decode
+        self.shape = (len(self._files), *shape)
+        self.dtype = np.dtype(dtype)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype)
+
+    def __getitem__(self, index: Any, /) -> np.ndarray:
+        if isinstance(index, slice):
+            frames = [self[i] for i in range(*index.indices(len(self._files)))]
+            return np.stack(frames) if frames else np.empty((0, *self.shape[1:]), self.dtype)
+        path = self._files[int(index)]
+        frame = self._decode(path)
+        if frame.shape != self.shape[1:]:
+            raise RecordingError(f"{path}: a picture of shape {frame.shape}; expected {self.shape[1:]} as the others.")
+        return frame
+
+
+def read_mat_depth(path: Path) -> np.ndarray:
+    """`depth_array` of a MATLAB file, uint16 (height, width) millimetres. Anything else raises `RecordingError`."""
+    depth = _load_mat(path, "depth_array")
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise RecordingError(
+            f"{path}: depth_array is {depth.dtype} of shape {depth.shape}; expected uint16 millimetres of shape (height, "
+            "width). Convert it."
+        )
+    return depth
+
+
+def _load_mat(path: str | Path, name: str) -> np.ndarray:
+    try:
+        told = scipy.io.loadmat(path, variable_names=[name])
+    # A file that is cut short makes SciPy raise nearly anything (zlib.error, TypeError, struct.error, ...).
+    except Exception as error:
+        raise RecordingError(
+            f"{path}: no readable MATLAB file ({type(error).__name__}: {error}). Copy it again; save it with -v7 if it is "
+            "of version 7.3."
+        ) from error
+    if name not in told:
+        raise RecordingError(f"{path}: no variable {name!r}. Was the copy cut short, or is this another file?")
+    return np.asarray(told[name])
+
+
+def load_calibration(path: str | Path, shape: tuple[int, int]) -> DepthToColour:
+    """Kdepth, Krgb, R, T of a `cam_params` structure; a translation in millimetres is turned into metres.
+
+    Raises `RecordingError` for a file without them.
+    """
+    told = _load_mat(path, "cam_params")
+    try:
+        told = told[0, 0]
+        depth, colour, rotation = (np.asarray(told[name], float).reshape(3, 3) for name in ("Kdepth", "Krgb", "R"))
+        translation = np.asarray(told["T"], float).reshape(3)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise RecordingError(
+            f"{path}: cam_params lacks something ({error}); expected Kdepth, Krgb and R, 3 x 3, and T, 3 numbers."
+        ) from error
+    if np.linalg.norm(translation) > 1.0:
+        translation = translation / 1000.0
+    height, width = shape
+
+    def camera(k: np.ndarray) -> Intrinsics:
+        return Intrinsics(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]), width, height)
+
+    return DepthToColour(camera(depth), camera(colour), rotation, translation)
+
+
+def import_jpg_mat(
+    folder: str | Path,
+    calibration: str | Path,
+    *,
+    fps: float,
+    correction: Sequence[float] | None = None,
+    masks: str | Path | None = None,
+    name: str | None = None,
+) -> Recording:
+    """A folder of NNN.jpg with NNN.mat beside (depth camera's view, millimetres), registered to colour.
+
+    The folder has no times: frames are stamped at `fps`. `correction` is a residual correction of the calibration
+    (see `DepthToColour.corrected`), as `registration.estimate_correction` gives it. `masks` is a folder of label
+    pictures, one a frame. The recording has no tag reads. Raises `RecordingError` where pictures or their .mat files are
+    missing or differ in size.
+    """
+    folder = Path(folder)
+    pictures = in_order(folder.glob("*.jpg"))
+    if not pictures:
+        raise RecordingError(f"{folder}: no .jpg file; expected pictures with .mat files of the same names.")
+    depths = [picture.with_suffix(".mat") for picture in pictures]
+    absent = [depth.name for depth in depths if not depth.is_file()]
+    if absent:
+        raise RecordingError(
+            f"{folder}: {len(absent)} of {len(pictures)} pictures have no depth beside them (no {', '.join(absent[:3])}"
+            f"{', ...' if len(absent) > 3 else ''}). Copy the missing files or remove those pictures."
+        )
+    if not np.isfinite(fps) or fps <= 0:
+        raise RecordingError(f"fps is {fps}; expected a positive frame rate.")
+    first = read_colour(pictures[0])
+    view = load_calibration(calibration, first.shape[:2])
+    if correction is not None:
+        view = view.corrected(correction)
+
+    def registered(path: Path) -> np.ndarray:
+        depth = read_mat_depth(path)
+        if depth.shape != first.shape[:2]:
+            raise RecordingError(
+                f"{path}: depth of shape {depth.shape}; expected {first.shape[:2]} as the pictures, which the calibration is for."
+            )
+        metres = depth.astype(np.float32) * np.float32(1e-3)
+        out = register_depth(metres, view.depth_camera, view.colour_camera, view.rotation, view.translation_m)
+        return np.rint(out * 1000).astype(np.uint16)
+
+    truth = None
+    if masks is not None:
+        labels = in_order(Path(masks).glob("*.png"))
+        if len(labels) != len(pictures):
+            raise RecordingError(f"{masks}: {len(labels)} masks for {len(pictures)} pictures; expected one a picture.")
+        truth = Truth(labels=FrameFiles(labels, read_labels, first.shape[:2], np.uint8))
+    return Recording(
+        colour=FrameFiles(pictures, read_colour, first.shape, np.uint8),
+        depth=FrameFiles(depths, registered, first.shape[:2], np.uint16),
+        time_ns=np.rint(np.arange(len(pictures)) / fps * 1e9).astype(np.int64),
+        intrinsics=view.colour_camera,
+        reads=TagReads.empty(),
+        truth=truth,
+        name=name or folder.name,
+        source=f"jpg + mat folder {folder.name}, {fps:g} frames/s assumed",
+    )
+
+
+TUM_INTRINSICS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6, ()),
+}
+"""fx, fy, cx, cy, distortion of the TUM RGB-D benchmark's colour cameras."""
+
+TUM_SHAPE = (480, 640)
+
+TUM_UNITS_PER_M = 5000.0
+
+
+def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: float = 0.02) -> Recording:
+    """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each picture with its nearest depth.
+
+    The camera is told by the folder's name if not given; its lens distortion is undone frame by frame. Pictures without
+    depth within `max_gap_s` are left out, and how many is said in the recording's source. Raises `RecordingError`.
+    """
+    folder = Path(folder)
+    listings = {kind: _tum_listing(folder / f"{kind}.txt") for kind in ("rgb", "depth")}
+    chosen = camera or next((name for name in TUM_INTRINSICS if name in folder.name), None)
+    if chosen not in TUM_INTRINSICS:
+        raise RecordingError(f"{folder}: unknown TUM camera {chosen!r}; give one of {', '.join(TUM_INTRINSICS)}.")
+    depth_s = np.array([stamp for stamp, _ in listings["depth"]])
+    order = np.argsort(depth_s)
+    pairs, dropped = [], 0
+    for stamp, picture in sorted(listings["rgb"]):
+        place = np.searchsorted(depth_s[order], stamp)
+        near = order[np.clip([place - 1, place], 0, len(order) - 1)]
+        best = near[np.argmin(np.abs(depth_s[near] - stamp))]
+        if abs(depth_s[best] - stamp) <= max_gap_s:
+            pairs.append((stamp, picture, listings["depth"][best][1]))
+        else:
+            dropped += 1
+    if not pairs:
+        raise RecordingError(f"{folder}: no picture has a depth map within {max_gap_s} s. Are both lists of one clock?")
+    absent = [path for _, *both in pairs for path in both if not path.is_file()]
+    if absent:
+        raise RecordingError(f"{folder}: {len(absent)} listed files are missing, first {absent[0]}. Copy them again.")
+    shape = read_colour(pairs[0][1]).shape
+    if shape[:2] != TUM_SHAPE:
+        raise RecordingError(
+            f"{pairs[0][1]}: a picture of {shape[:2]}; expected {TUM_SHAPE}, which TUM's intrinsics are for."
+        )
+    fx, fy, cx, cy, distortion = TUM_INTRINSICS[chosen]
+    lens = Intrinsics(fx, fy, cx, cy, shape[1], shape[0], distortion)
+
+    def colour(path: Path) -> np.ndarray:
+        picture = read_colour(path)
+        if not distortion or picture.shape != shape:  # another shape is refused with the file's name
+            return picture
+        return undistort(picture, np.zeros(shape[:2], np.float32), lens)[0]
+
+    def depth_mm(path: Path) -> np.ndarray:
+        raw = read_picture(path, cv2.IMREAD_UNCHANGED)
+        if raw.dtype != np.uint16 or raw.ndim != 2:
+            raise RecordingError(f"{path}: {raw.dtype} of shape {raw.shape}; expected a 16-bit grey depth picture.")
+        depth = np.rint(raw * (1000.0 / TUM_UNITS_PER_M)).astype(np.float32)
+        if distortion and depth.shape == shape[:2]:
+            depth = undistort(np.zeros(shape, np.uint8), depth, lens)[1]
+        return depth.astype(np.uint16)
+
+    undone = f"; lens distortion of {chosen} undone" if distortion else ""
+    return Recording(
+        colour=FrameFiles([p for _, p, _ in pairs], colour, shape, np.uint8),
+        depth=FrameFiles([d for _, _, d in pairs], depth_mm, shape[:2], np.uint16),
+        time_ns=np.array([round(stamp * 1e9) for stamp, _, _ in pairs], np.int64),
+        intrinsics=dataclasses.replace(lens, distortion=()),
+        reads=TagReads.empty(),
+        name=folder.name,
+        source=f"TUM RGB-D {folder.name}; {dropped} of {len(listings['rgb'])} pictures without depth left out{undone}",
+    )
+
+
+def _tum_listing(path: Path) -> list[tuple[float, Path]]:
+    if not path.is_file():
+        raise RecordingError(f"{path}: missing; a TUM RGB-D folder lists its pictures there.")
+    rows = []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamp, name = float(words[0]), words[1]
+        except (ValueError, IndexError) as error:
+            raise RecordingError(f"{path}, line {number}: {line!r}; expected a time and a file name.") from error
+        rows.append((stamp, path.parent / name))
+    if not rows:
+        raise RecordingError(f"{path}: lists no picture.")
+    return rows

@@ -1,0 +1,214 @@
+"""RFID tables to tag reads: the format is recognised, every rejected row is counted and said."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ...core.errors import RecordingError, RecordingWarning
+from ..reads import TagReads
+from ..recording import ClockAudit
+from .clock import audit_clocks, reader_epoch, to_host_ns
+from .formats import FORMATS, Format, Read, RowError, recognise
+
+MAX_REJECTED = 0.5
+"""A table of which more is rejected is taken for one of another format."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportReport:
+    """What an import found: rows taken and rejected, by reason, and what was done about it."""
+
+    format: str
+    num_rows: int
+    num_reads: int
+    rejected: dict[str, int]
+    notes: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The report as lines of text."""
+        out = [f"format {self.format}: {self.num_reads} reads of {self.num_rows} rows"]
+        out += [f"rejected {count}: {reason}" for reason, count in sorted(self.rejected.items())]
+        return out + list(self.notes)
+
+
+def import_table(
+    path: str | Path,
+    *,
+    format: str = "auto",
+    hop_table_hz: Sequence[float] | None = None,
+    carrier_hz: float | None = None,
+    clock: Literal["auto", "reader", "arrival"] | float = "auto",
+    synthetic_rate_hz: float = 50.0,
+) -> tuple[TagReads, ClockAudit | None, ImportReport]:
+    """Read an RFID table: `TagReads` in order of host time, a clock audit where both clocks are there, and a report.
+
+    Args:
+        path: the table.
+        format: a name in `FORMATS`, or "auto" to tell by the header.
+        hop_table_hz: carriers of channel index 1, 2, ... (readers number their own, shuffled hop table).
+        carrier_hz: the one carrier of a reader that does not hop.
+        clock: "reader" uses the reader's clock as it is, "arrival" the host's; a number of seconds is added to the
+            reader's; "auto" moves reader times onto the host's clock by an audit where both are there.
+        synthetic_rate_hz: rows of a table without times are stamped in order, each tag at this rate.
+
+    Raises `RecordingError` if no format fits, phases are absent, or more than half of the rows are rejected.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such file.")
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    chosen = _choose(path, lines, format)
+    if chosen.name == "sllurp_log":
+        raise RecordingError(
+            f"{path}: a sllurp log without phases. Enable phase reports (impinj_tag_content_selector: "
+            "EnableRFPhaseAngle) and record again."
+        )
+    rejected: collections.Counter[str] = collections.Counter()
+    reads: list[Read] = []
+    num_rows = 0
+    for row in chosen.rows(lines):
+        num_rows += 1
+        try:
+            reads.append(_taken(chosen.read(row)))
+        except RowError as error:
+            rejected[str(error)] += 1
+        except (KeyError, TypeError, AttributeError):
+            rejected["columns are missing"] += 1
+    if num_rows == 0 or len(reads) < (1 - MAX_REJECTED) * num_rows:
+        reasons = "; ".join(f"{count} times: {reason}" for reason, count in rejected.most_common(3)) or "no row"
+        raise RecordingError(
+            f"{path}: {num_rows - len(reads)} of {num_rows} rows are no {chosen.name} reads ({reasons}). Wrong format or "
+            "units? Set format= to one of " + ", ".join(FORMATS) + "."
+        )
+    notes: list[str] = []
+    host_ns, reader_ns, audit = _times(reads, clock, synthetic_rate_hz, notes)
+    carrier, index = _carriers(reads, hop_table_hz, carrier_hz, notes)
+    table = TagReads(
+        epc=np.array([read.epc for read in reads]),
+        time_ns=host_ns,
+        antenna=np.array([read.antenna for read in reads], np.int16),
+        carrier_hz=carrier,
+        phase_rad=np.array([read.phase_rad for read in reads], np.float64),
+        rssi_dbm=np.array([np.nan if read.rssi_dbm is None else read.rssi_dbm for read in reads], np.float32),
+        doppler_hz=np.array([np.nan if read.doppler_hz is None else read.doppler_hz for read in reads], np.float32),
+        reader_time_ns=reader_ns,
+        channel_index=index,
+        hop_table_hz=tuple(hop_table_hz or ()),
+    )
+    order = np.argsort(table.time_ns, kind="stable")
+    back = int(np.sum(np.diff(table.time_ns) < 0))
+    if back:
+        notes.append(f"{back} reads were out of order of time and have been sorted")
+    table = table[order]
+    twice = np.concatenate(
+        [
+            [False],
+            (np.diff(table.time_ns) == 0)
+            & (table.epc[1:] == table.epc[:-1])
+            & (table.antenna[1:] == table.antenna[:-1])
+            & (table.phase_rad[1:] == table.phase_rad[:-1]),
+        ]
+    )
+    if twice.any():
+        rejected["repeats the read before it"] = int(twice.sum())
+        table = table[~twice]
+    return table, audit, ImportReport(chosen.name, num_rows, table.num_reads, dict(rejected), tuple(notes))
+
+
+def _choose(path: Path, lines: list[str], name: str) -> Format:
+    if name != "auto":
+        if name not in FORMATS:
+            raise RecordingError(f"Unknown format {name!r}; expected auto or one of {', '.join(FORMATS)}.")
+        return FORMATS[name]
+    found = recognise(lines)
+    if found is None:
+        head = lines[0][:120] if lines else "nothing"
+        raise RecordingError(
+            f"{path}: no known header (first line: {head!r}). Known formats: {', '.join(FORMATS)}; set format= if it is one."
+        )
+    return found
+
+
+def _taken(read: Read) -> Read:
+    if read.phase_rad is None:
+        raise RowError("phase is absent")
+    if read.antenna < 1:
+        raise RowError("antenna is below 1")
+    if read.rssi_dbm is not None and not -120 <= read.rssi_dbm <= 20:
+        raise RowError("RSSI is outside -120 to 20 dBm: wrong unit?")
+    if read.carrier_hz is not None and not 300e6 <= read.carrier_hz <= 6e9:
+        raise RowError("carrier is outside 0.3 to 6 GHz: wrong unit?")
+    return read
+
+
+def _times(
+    reads: list[Read], clock: str | float, rate_hz: float, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray | None, ClockAudit | None]:
+    def column(name: str) -> np.ndarray | None:
+        values = [getattr(read, name) for read in reads]
+        return None if any(value is None for value in values) else np.array(values, np.int64)
+
+    reader, host = column("reader_ns"), column("host_ns")
+    if reader is None and host is None:
+        seen: collections.Counter[str] = collections.Counter()
+        stamps = []
+        for read in reads:
+            stamps.append(round(seen[read.epc] / rate_hz * 1e9))
+            seen[read.epc] += 1
+        warnings.warn(
+            f"The table holds no times: reads are stamped in order, {rate_hz:g} a second and tag.",
+            RecordingWarning,
+            stacklevel=4,
+        )
+        notes.append(f"no times in the table: stamped in order at {rate_hz:g} reads/s a tag")
+        return np.array(stamps, np.int64), None, None
+    audit = audit_clocks(reader, host) if reader is not None and host is not None and len(reads) > 1 else None
+    if reader is not None and reader_epoch(reader) != "unix":
+        told = f"the reader's clock was never set: it started in {reader_epoch(reader)}"
+        warnings.warn(told[0].upper() + told[1:] + ".", RecordingWarning, stacklevel=4)
+        notes.append(told)
+    if isinstance(clock, int | float) and not isinstance(clock, bool):
+        if reader is None:
+            raise RecordingError(f"clock={clock}: an offset is added to the reader's clock, which this table lacks.")
+        return reader + round(clock * 1e9), reader, audit
+    if clock == "arrival" or reader is None:
+        if host is None:
+            raise RecordingError("clock=arrival: the table holds no arrival times. Use clock=reader or an offset.")
+        return host, reader, audit
+    if clock == "auto" and audit is not None:
+        notes.append(
+            f"reader times moved onto the host's clock: offset {audit.offset_s:.3f} s, drift {audit.drift_ppm:.1f} ppm, "
+            f"residual {audit.residual_ms:.2f} ms"
+        )
+        return to_host_ns(reader, audit), reader, audit
+    return reader, reader, audit
+
+
+def _carriers(
+    reads: list[Read], hop_table_hz: Sequence[float] | None, carrier_hz: float | None, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    carrier = np.array([np.nan if read.carrier_hz is None else read.carrier_hz for read in reads])
+    index = None
+    if all(read.channel_index is not None for read in reads):
+        index = np.array([read.channel_index for read in reads], np.int16)
+    unknown = np.isnan(carrier)
+    if unknown.any() and hop_table_hz is not None and index is not None:
+        if index.min() < 1 or index.max() > len(hop_table_hz):
+            raise RecordingError(
+                f"Channel indices {index.min()} to {index.max()}; the hop table has entries 1 to {len(hop_table_hz)}."
+            )
+        carrier = np.where(unknown, np.asarray(hop_table_hz, float)[index - 1], carrier)
+    elif unknown.any() and carrier_hz is not None:
+        carrier = np.where(unknown, carrier_hz, carrier)
+    elif unknown.any():
+        told = "carriers are unknown: give the reader's own hop table (hop_table_hz) or its one carrier (carrier_hz)"
+        warnings.warn(told[0].upper() + told[1:] + ".", RecordingWarning, stacklevel=4)
+        notes.append(told)
+    return carrier, index

@@ -1,0 +1,145 @@
+"""Tag reads: one column an attribute, one row a read."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from ..core.errors import RecordingError, RecordingWarning
+
+
+def join_reads(parts: Sequence[TagReads]) -> TagReads:
+    """The reads of several tables in order of time. Raises `RecordingError` where their phase conventions differ."""
+    first = parts[0]
+    for part in parts[1:]:
+        if (part.phase_period_rad, part.phase_sign) != (first.phase_period_rad, first.phase_sign):
+            raise RecordingError("Reads of differing phase period or sign cannot be put into one table; convert first.")
+    columns = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in dataclasses.fields(first)
+        if all(isinstance(getattr(part, field.name), np.ndarray) for part in parts)
+    }
+    return dataclasses.replace(first, **columns)[np.argsort(columns["time_ns"], kind="stable")]
+
+
+@dataclasses.dataclass(frozen=True)
+class TagReads:
+    """Tag reads in order of host time, one array element a read.
+
+    `carrier_hz` is NaN where the carrier is unknown (a channel index without its hop table); `doppler_hz` and
+    `rssi_dbm` are NaN where the reader gave none. `phase_rad` is as reported, in [0, phase_period_rad); it grows with
+    distance where `phase_sign` is +1 (Impinj), shrinks where it is -1.
+    """
+
+    epc: np.ndarray  # (num_reads,) str
+    time_ns: np.ndarray  # (num_reads,) int64, host clock
+    antenna: np.ndarray  # (num_reads,) int16, counted from 1
+    carrier_hz: np.ndarray  # (num_reads,) float64
+    phase_rad: np.ndarray  # (num_reads,) float64
+    rssi_dbm: np.ndarray  # (num_reads,) float32
+    doppler_hz: np.ndarray  # (num_reads,) float32
+    reader_time_ns: np.ndarray | None = None  # (num_reads,) int64, reader clock
+    channel_index: np.ndarray | None = None  # (num_reads,) int16, counted from 1 into hop_table_hz
+    hop_table_hz: tuple[float, ...] = ()
+    phase_period_rad: float = 2 * np.pi
+    phase_sign: Literal[-1, 1] = 1
+    pi_flips: bool | None = None  # None = unknown: estimators decide from the reads
+
+    @property
+    def num_reads(self) -> int:
+        return len(self.time_ns)
+
+    @property
+    def epcs(self) -> list[str]:
+        """The EPCs that were read, sorted."""
+        return sorted({str(epc) for epc in self.epc})
+
+    def __getitem__(self, index: Any) -> TagReads:
+        """The reads that a mask, slice or index array selects."""
+        columns = {
+            field.name: getattr(self, field.name)[index]
+            for field in dataclasses.fields(self)
+            if isinstance(getattr(self, field.name), np.ndarray)
+        }
+        return dataclasses.replace(self, **columns)
+
+    def select(self, epc: str) -> TagReads:
+        """The reads of one tag. An EPC that was never read raises `RecordingError`."""
+        found = self.epc == epc
+        if not found.any():
+            known = ", ".join(self.epcs) or "none"
+            raise RecordingError(f"EPC {epc!r} was never read. EPCs in this recording: {known}. Name one of these.")
+        return self[found]
+
+    @classmethod
+    def empty(cls) -> TagReads:
+        """No reads at all."""
+        return cls(
+            epc=np.empty(0, dtype="<U24"),
+            time_ns=np.empty(0, dtype=np.int64),
+            antenna=np.empty(0, dtype=np.int16),
+            carrier_hz=np.empty(0, dtype=np.float64),
+            phase_rad=np.empty(0, dtype=np.float64),
+            rssi_dbm=np.empty(0, dtype=np.float32),
+            doppler_hz=np.empty(0, dtype=np.float32),
+        )
+
+    def check(self) -> None:
+        """Raise `RecordingError` for reads that cannot be used; warn of those that can be, unusual as they are."""
+        num_reads = self.num_reads
+        for field in dataclasses.fields(self):
+            column = getattr(self, field.name)
+            if isinstance(column, np.ndarray) and column.shape != (num_reads,):
+                raise RecordingError(
+                    f"Tag reads: column {field.name} has shape {column.shape}; expected ({num_reads},) as time_ns has."
+                )
+        if num_reads == 0:
+            warnings.warn("The recording holds no tag read: nothing can be traced.", RecordingWarning, stacklevel=3)
+            return
+        if np.any(np.diff(self.time_ns) < 0):
+            first = int(np.argmax(np.diff(self.time_ns) < 0)) + 1
+            raise RecordingError(
+                f"Tag reads: time goes back at read {first}; expected reads in order of time. "
+                "Sort them (the importers do)."
+            )
+        for name, limit, unit in (("phase_rad", self.phase_period_rad + 1e-6, "rad"),):
+            column = getattr(self, name)
+            if not np.all(np.isfinite(column)):
+                bad = int(np.sum(~np.isfinite(column)))
+                raise RecordingError(f"Tag reads: {bad} of {num_reads} values of {name} are not finite; drop them.")
+            if column.min() < -1e-6 or column.max() > limit:
+                raise RecordingError(
+                    f"Tag reads: {name} spans [{column.min():.4g}, {column.max():.4g}]; expected [0, {limit:.4g}] {unit}. "
+                    "Degrees or raw codes must be converted first."
+                )
+        known = np.isfinite(self.carrier_hz)
+        if not known.all():
+            warnings.warn(
+                f"The carrier of {int(np.sum(~known))} of {num_reads} reads is unknown (a channel index needs the "
+                "reader's hop table): these reads carry no distance.",
+                RecordingWarning,
+                stacklevel=3,
+            )
+        carriers = self.carrier_hz[known]
+        if carriers.size and (carriers.min() < 300e6 or carriers.max() > 6e9):
+            raise RecordingError(
+                f"Tag reads: carrier_hz spans [{carriers.min():.4g}, {carriers.max():.4g}]; expected a UHF carrier in Hz, "
+                "about 9e8. MHz or kHz must be converted first."
+            )
+        if carriers.size and carriers.max() - carriers.min() > 120e6:
+            raise RecordingError(
+                f"Tag reads: carriers from {carriers.min() / 1e6:.1f} to {carriers.max() / 1e6:.1f} MHz are mixed; one "
+                "reader's band spans at most about 100 MHz. Import each reader by itself."
+            )
+        rssi = self.rssi_dbm[np.isfinite(self.rssi_dbm)]
+        if rssi.size and (rssi.min() < -120 or rssi.max() > 20):
+            raise RecordingError(
+                f"Tag reads: rssi_dbm spans [{rssi.min():.4g}, {rssi.max():.4g}]; expected dBm between -120 and 20. "
+                "Centi-dBm must be divided by 100 first."
+            )
+        if np.any(self.antenna < 1):
+            raise RecordingError(f"Tag reads: antenna {int(self.antenna.min())} found; antennas are counted from 1.")

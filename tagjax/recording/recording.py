@@ -1,0 +1,197 @@
+"""The Recording: what a camera and a reader saw, with optional truth, on the host and opened lazily.
+
+Everything here is NumPy (or a lazily read Zarr array); nothing touches a device. Times are int64 nanoseconds of the
+host clock. `Recording.check` holds a recording against what every later stage relies on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from ..core.camera import Intrinsics
+from ..core.errors import RecordingError, RecordingWarning
+from ..core.types import LazyArray
+from .reads import TagReads
+
+MAX_RANGE_M = 30.0
+"""Depth beyond this is taken for a wrong unit: no RGB-D camera of the kind reaches it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """What is known to be true. Every part is optional; a lazily read array stays unread until indexed."""
+
+    labels: LazyArray | None = None  # (num_frames, height, width) uint8: 0 background, 255 ignore, else an object
+    tag_to_label: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    boxes_px: np.ndarray | None = None  # (num_frames, num_labels, 4) float32 x0 y0 x1 y1 inclusive; NaN = unseen
+    tag_range_m: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,), NaN unknown
+    tag_position_m: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames, 3) camera
+    visible: Mapping[int, np.ndarray] = dataclasses.field(default_factory=dict)  # label: (num_frames,) bool
+    flow_px: LazyArray | None = None  # (num_frames, height, width, 2) flow from frame t to t + 1; last one NaN
+    occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is hidden
+    backward_flow_px: LazyArray | None = None  # (num_frames, height, width, 2) from frame t to t - 1; first one NaN
+    backward_occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is hidden
+    line_of_sight: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,) share of
+    # the field that reaches the first antenna straight: 1 free, 0 blocked
+
+    IGNORE = 255
+
+
+@dataclasses.dataclass(frozen=True)
+class ClockAudit:
+    """How the reader's clock relates to the host's: host = reader + offset + drift * (reader - first reader time)."""
+
+    offset_s: float
+    drift_ppm: float
+    residual_ms: float
+    num_reads: int
+    reader_epoch: str  # "unix", "1970" or "2000": the latter two say that the reader's clock was never set
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """One RGB-D video with its tag reads.
+
+    `depth` holds millimetres as uint16, or metres as float32; 0 (or NaN) = missing. It is z-depth or range to the
+    camera, as `depth_kind` says, in the view of the colour camera whose `intrinsics` these are. `antennas_m` are
+    antenna positions in the camera frame (x right, y down, z forward), row i for antenna i + 1.
+    """
+
+    colour: LazyArray  # (num_frames, height, width, 3) uint8 RGB
+    depth: LazyArray  # (num_frames, height, width)
+    time_ns: np.ndarray  # (num_frames,) int64 host clock
+    intrinsics: Intrinsics
+    reads: TagReads
+    antennas_m: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((1, 3)))  # (num_antennas, 3)
+    depth_kind: Literal["depth", "range"] = "depth"
+    truth: Truth | None = None
+    clock: ClockAudit | None = None
+    name: str = "recording"
+    source: str = ""  # what it was made from, and how
+    store: Any = None  # the open Zarr group, where it comes from one
+    forwards: Recording | None = None  # the recording that this one is, played backwards
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.time_ns)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        return (self.intrinsics.height, self.intrinsics.width)
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Median frame rate; NaN for a single frame."""
+        return float(1e9 / np.median(np.diff(self.time_ns))) if self.num_frames > 1 else float("nan")
+
+    def frame_time_s(self) -> np.ndarray:
+        """Frame times in seconds from the first frame, float64."""
+        return (self.time_ns - self.time_ns[0]) * 1e-9
+
+    def depth_metres(self, frames: int | slice) -> np.ndarray:
+        """Raw depth values (z or range, as `depth_kind` says) in metres, float32, 0 where missing."""
+        raw = np.asarray(self.depth[frames])
+        metres = raw.astype(np.float32) * np.float32(1e-3 if raw.dtype.kind in "ui" else 1.0)
+        return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
+
+    def resolve_epcs(self, epcs: Sequence[str] | None) -> list[str]:
+        """The given EPCs, each checked to have been read; all that were read if None."""
+        if epcs is None:
+            return self.reads.epcs
+        for epc in epcs:
+            self.reads.select(epc)
+        return list(epcs)
+
+    def with_reads(self, reads: TagReads, truth: Truth | None = None) -> Recording:
+        """The same video with other reads (and, if given, other truth)."""
+        return dataclasses.replace(self, reads=reads, truth=self.truth if truth is None else truth)
+
+    def check(self, *, depth: bool = True) -> None:
+        """Raise `RecordingError` where a later stage could not go on; warn where it can.
+
+        Reads frame metadata and three depth frames only, so that it stays cheap for a remote recording; nothing is asked
+        of depth without `depth`. A recording that has none is warned of: TagAttention needs it, the forerunners do not.
+        """
+        num_frames, shape = self.num_frames, self.image_shape
+        if num_frames == 0:
+            raise RecordingError(f"{self.name}: no frame. A recording needs at least one.")
+        self.intrinsics.check()
+        if self.colour.shape != (num_frames, *shape, 3) or self.colour.dtype != np.uint8:
+            raise RecordingError(
+                f"{self.name}: colour is {self.colour.dtype} of shape {self.colour.shape}; expected uint8 of shape "
+                f"{(num_frames, *shape, 3)} (frames, height, width, RGB) as times and intrinsics say."
+            )
+        if depth and self.depth.shape != (num_frames, *shape):
+            raise RecordingError(
+                f"{self.name}: depth has shape {self.depth.shape}; expected {(num_frames, *shape)}, registered to colour. "
+                "Use geometry.register_depth for a depth camera beside the colour camera."
+            )
+        if depth and np.dtype(self.depth.dtype) not in (np.dtype(np.uint16), np.dtype(np.float32)):
+            raise RecordingError(f"{self.name}: depth is {self.depth.dtype}; expected uint16 mm or float32 m.")
+        steps = np.diff(self.time_ns)
+        if np.any(steps <= 0):
+            first = int(np.argmax(steps <= 0)) + 1
+            raise RecordingError(
+                f"{self.name}: frame {first} is stamped {int(-steps[first - 1]) / 1e6:.3f} ms before or at frame {first - 1}; "
+                "expected strictly increasing times. Drop or re-stamp the frame."
+            )
+        if self.antennas_m.ndim != 2 or self.antennas_m.shape[1] != 3 or not np.all(np.isfinite(self.antennas_m)):
+            raise RecordingError(
+                f"{self.name}: antennas_m has shape {self.antennas_m.shape}; expected finite (antennas, 3) metres."
+            )
+        if depth:
+            self._check_depth_values()
+        self.reads.check()
+        if self.reads.num_reads:
+            highest = int(self.reads.antenna.max())
+            if highest > len(self.antennas_m):
+                raise RecordingError(
+                    f"{self.name}: reads of antenna {highest}, but antennas_m places {len(self.antennas_m)}. Give all places."
+                )
+            inside = (self.reads.time_ns >= self.time_ns[0]) & (self.reads.time_ns <= self.time_ns[-1])
+            if not inside.any():
+                gap_s = (int(self.reads.time_ns[0]) - int(self.time_ns[0])) * 1e-9
+                raise RecordingError(
+                    f"{self.name}: no read falls between the first and the last frame (first read {gap_s:+.1f} s from the "
+                    "first frame). Reader and camera clocks differ: import with clock=arrival, or with clock=<seconds to add to the reader's clock>."
+                )
+
+    def check_has_depth(self) -> None:
+        """Raise `RecordingError` where none of the frames that `check` looks at has any depth."""
+        sampled, values = self._sampled_depth()
+        if not np.any(values > 0):
+            raise RecordingError(
+                f"{self.name}: frames {sampled} hold no depth at all; TagAttention needs depth. Was it exported?"
+            )
+
+    def _sampled_depth(self) -> tuple[list[int], np.ndarray]:
+        sampled = sorted({0, self.num_frames // 2, self.num_frames - 1})
+        return sampled, np.stack([self.depth_metres(frame) for frame in sampled])
+
+    def _check_depth_values(self) -> None:
+        sampled, values = self._sampled_depth()
+        measured = values[values > 0]
+        if measured.size == 0:
+            warnings.warn(
+                f"{self.name}: frames {sampled} hold no depth at all: TagAttention cannot trace here, only systems that "
+                "need none. Was it exported?",
+                RecordingWarning,
+                stacklevel=4,
+            )
+            return
+        if np.median(measured) > MAX_RANGE_M or np.median(measured) < 0.05:
+            raise RecordingError(
+                f"{self.name}: median depth {np.median(measured):.4g} m; expected 0.05 to {MAX_RANGE_M:g}. Wrong unit? uint16 "
+                "is read as millimetres, float32 as metres (TUM's PNG files hold 1/5000 m)."
+            )
+        for frame, image in zip(sampled, values, strict=True):
+            if not np.any(image > 0):
+                warnings.warn(
+                    f"{self.name}: frame {frame} has no depth; it is carried.", RecordingWarning, stacklevel=4
+                )

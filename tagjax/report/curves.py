@@ -1,0 +1,50 @@
+"""Curves of scores against frame number (TagAttention, Figs. 12-15), one line a tracer. Needs the viz extra."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from .figure import blank
+
+
+def score_curves(
+    path: Path,
+    lines: Mapping[str, Mapping[str, Shaped[np.ndarray, " time"]]],
+    valid: Shaped[np.ndarray, " time"],
+    *,
+    first_frame: int = 0,
+    title: str = "",
+) -> None:
+    """Write a PNG with IoU and centre error (CLE) of each tracer against frame number.
+
+    `lines` maps a tracer's name to its `iou` and `cle_px`; frames that are not scored are shaded.
+    """
+    frame = first_frame + np.arange(len(valid))
+    figure = blank(8.0, 5.0)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for name, line in lines.items():
+        upper.plot(frame, line["iou"], label=name, linewidth=1.4)
+        lower.plot(frame, line["cle_px"], label=name, linewidth=1.4)
+    for axes in (upper, lower):
+        left_out = ~np.asarray(valid, dtype=bool)
+        axes.fill_between(
+            frame,
+            0,
+            1,
+            where=left_out.tolist(),
+            step="mid",
+            color="0.9",
+            transform=axes.get_xaxis_transform(),
+            zorder=0,
+        )
+        axes.grid(alpha=0.3)
+    upper.set(ylabel="box IoU", ylim=(-0.02, 1.02))
+    upper.set_title(title, loc="left", fontsize=10)
+    lower.set(ylabel="CLE (px of 512)", xlabel="frame number (shaded: not scored)")
+    lower.set_ylim(bottom=0)
+    upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=4)  # beside the title
+    figure.savefig(path, dpi=110)

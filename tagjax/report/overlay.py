@@ -1,0 +1,114 @@
+"""Overlay pictures: masks, boxes and confidences drawn over the colour picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Shaped, UInt8
+
+PALETTE_RGB = (
+    (255, 99, 71),
+    (64, 156, 255),
+    (80, 200, 120),
+    (255, 200, 40),
+    (190, 110, 255),
+    (0, 210, 210),
+    (255, 130, 200),
+    (170, 140, 90),
+)
+"""Colours of tags in their order, distinguishable on dark and on bright pictures."""
+
+_SIZE = 0.45
+"""Font scale, as OpenCV counts it."""
+
+_LINE = 14
+"""Line spacing of text, pixels."""
+
+MIN_WIDTH = 480
+"""Smaller pictures are enlarged by an integer factor, so that outlines and names stay readable."""
+
+
+def draw_overlay(
+    colour: UInt8[np.ndarray, "height width 3"],
+    names: Sequence[str],
+    masks: Bool[np.ndarray, "tag height width"],
+    boxes_px: Float[np.ndarray, "tag 4"],
+    confidence: Float[np.ndarray, " tag"],
+    detected: Bool[np.ndarray, " tag"],
+    *,
+    true_boxes_px: Shaped[np.ndarray, "tag 4"] | None = None,
+    caption: str = "",
+) -> UInt8[np.ndarray, "picture_height picture_width 3"]:
+    """RGB picture with the tint, outline, box, name and confidence of each detected object; true boxes thin and white."""
+    scale = -(-MIN_WIDTH // colour.shape[1])
+    picture = np.ascontiguousarray(colour.repeat(scale, axis=0).repeat(scale, axis=1))
+    masks = masks.repeat(scale, axis=1).repeat(scale, axis=2)
+    boxes_px = boxes_px * scale
+    true_boxes_px = None if true_boxes_px is None else true_boxes_px * scale
+    labels: list[tuple[str, tuple[int, int, int, int], tuple[int, int, int]]] = []
+    for tag, name in enumerate(names):
+        shade = PALETTE_RGB[tag % len(PALETTE_RGB)]
+        if true_boxes_px is not None and np.all(np.isfinite(true_boxes_px[tag])):
+            x0, y0, x1, y1 = np.round(true_boxes_px[tag]).astype(int).tolist()
+            cv2.rectangle(picture, (x0, y0), (x1, y1), (255, 255, 255), 1)
+        if not detected[tag] or not np.all(np.isfinite(boxes_px[tag])):
+            continue
+        mask = masks[tag]
+        tinted = 0.65 * picture[mask].astype(np.float32) + 0.35 * np.array(shade, np.float32)
+        picture[mask] = tinted.astype(np.uint8)
+        outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, outline, -1, shade, 1)
+        x0, y0, x1, y1 = np.round(boxes_px[tag]).astype(int).tolist()
+        cv2.rectangle(picture, (x0, y0), (x1, y1), shade, 2)
+        labels.append((f"{name} {confidence[tag]:.2f}", (x0, y0, x1, y1), shade))
+    taken: list[tuple[int, int, int, int]] = []
+    if caption:
+        place = 6, picture.shape[0] - 8
+        _text(picture, caption, place, (255, 255, 255))
+        taken.append(_extent(caption, place))
+    for text, box, shade in labels:
+        place = _free_place(text, box, taken, picture.shape[:2])
+        _text(picture, text, place, shade)
+        taken.append(_extent(text, place))
+    return picture
+
+
+def _extent(text: str, place: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of a text whose baseline begins at `place`."""
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, 1)
+    return place[0], place[1] - _LINE + 3, place[0] + width, place[1] + 3
+
+
+def _free_place(
+    text: str, box: tuple[int, int, int, int], taken: Sequence[tuple[int, int, int, int]], shape: tuple[int, ...]
+) -> tuple[int, int]:
+    """A place for a box's label that covers no other label: the nearest line above the box, else below, else inside."""
+    x0, y0, _, y1 = box
+    left, _, right, _ = _extent(text, (0, 0))
+    x = max(min(x0, shape[1] - (right - left) - 2), 2)
+    above = range(max(y0 - 5, 12), 11, -_LINE)
+    below = range(min(y1 + _LINE, shape[0] - 4), shape[0] - 3, _LINE)
+    inside = range(above[-1] + _LINE, shape[0] - 3, _LINE)
+    for y in (*above, *below, *inside):
+        x_left, top, x_right, bottom = _extent(text, (x, y))
+        if all(x_right <= a or x_left >= c or bottom <= b or top >= d for a, b, c, d in taken):
+            return x, y
+    return x, above[0]
+
+
+def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
+    # A dark outline keeps letters readable on any background. It is drawn by shifts: thicker letters are also wider.
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        _letters(picture, text, (place[0] + dx, place[1] + dy), (0, 0, 0))
+    _letters(picture, text, place, shade)
+
+
+def _letters(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, shade, 1, cv2.LINE_AA)
+
+
+def short_name(epc: str, length: int = 6) -> str:
+    """A shortened EPC: its end, where EPCs of one batch differ."""
+    return epc if len(epc) <= length else f"..{epc[-length:]}"

@@ -1,0 +1,187 @@
+"""The report of an evaluation: metrics.json, frames.csv, overlay pictures and curves in one folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.box import SIMPLE
+from rich.table import Table
+
+from ..metrics.recordings import RecordingResult
+from ..metrics.tracking import Scores, label_box
+from .overlay import draw_overlay, short_name
+
+Results = Mapping[str, Sequence[RecordingResult]]
+"""Results of each tracer, by name, one element a recording; the recordings are the same for all."""
+
+_COLUMNS = ("iou", "cle_px", "mask_j", "identified", "confidence", "detected", "visible", "has_moved")
+
+
+def summarise(results: Results) -> dict[str, Any]:
+    """Plain JSON: for each tracer the scores of all, of each recording and of each tag."""
+    summary: dict[str, Any] = {}
+    for tracer, ones in results.items():
+        total = Scores()
+        recordings: dict[str, Any] = {}
+        for number, one in enumerate(ones):
+            total = total.merge(one.scores())
+            tags = {epc: scores.result() for epc, scores in one.tag_scores().items()}
+            recordings[_recording_name(ones, number)] = {"all": one.scores().result(), "tags": tags}
+        summary[tracer] = {"all": total.result(), "recordings": recordings}
+    return summary
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically. NaN and infinity become null."""
+    beside = path.with_name(path.name + ".part")
+    beside.write_text(json.dumps(plain(content), indent=2) + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+def plain(content: Any) -> Any:
+    """Convert to numbers, strings, lists and dictionaries; numbers that are not finite become None."""
+    if isinstance(content, Mapping):
+        return {str(key): plain(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [plain(value) for value in content]
+    if isinstance(content, np.ndarray):
+        return plain(content.tolist())
+    if isinstance(content, np.generic):
+        return plain(content.item())
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content
+
+
+def write_report(folder: Path, results: Results) -> dict[str, Any]:
+    """Write the whole report and return its summary."""
+    folder.mkdir(parents=True, exist_ok=True)
+    summary = summarise(results)
+    write_json(folder / "metrics.json", summary)
+    write_frames(folder / "frames.csv", results)
+    for tracer, ones in results.items():
+        for number, one in enumerate(ones):
+            write_overlays(folder / "overlays" / _recording_name(ones, number) / tracer, one)
+    write_curves(folder / "curves", results)
+    return summary
+
+
+def write_frames(path: Path, results: Results) -> None:
+    """One CSV row for each tracer, recording, tag and frame."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(("tracer", "recording", "epc", "label", "frame", "time_s", *_COLUMNS))
+        for tracer, ones in results.items():
+            for number, one in enumerate(ones):
+                for epc, frames in one.frames.items():
+                    offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
+                    for index, time_s in enumerate(frames.time_s):
+                        values = [getattr(frames, column)[index] for column in _COLUMNS]
+                        written = [int(v) if isinstance(v, np.bool_ | np.integer) else f"{v:.6g}" for v in values]
+                        head = (
+                            tracer,
+                            _recording_name(ones, number),
+                            epc,
+                            frames.label,
+                            offset + index,
+                            f"{time_s:.4f}",
+                        )
+                        rows.writerow((*head, *written))
+
+
+def write_overlays(folder: Path, result: RecordingResult) -> None:
+    """One PNG for each kept frame; true boxes are thin and white."""
+    folder.mkdir(parents=True, exist_ok=True)
+    truth = result.recording.truth
+    for picture in result.pictures:
+        true_boxes = np.full((len(picture.epcs), 4), np.nan)
+        if truth is not None and truth.labels is not None:
+            labels = np.asarray(truth.labels[picture.frame])
+            for tag, epc in enumerate(picture.epcs):
+                if epc in truth.tag_to_label:
+                    true_boxes[tag] = label_box(labels, truth.tag_to_label[epc])
+        drawn = draw_overlay(
+            np.asarray(result.recording.colour[picture.frame]),
+            [short_name(epc) for epc in picture.epcs],
+            picture.masks,
+            picture.boxes_px,
+            picture.confidence,
+            picture.detected,
+            true_boxes_px=true_boxes,
+            caption=f"frame {picture.frame}",
+        )
+        cv2.imwrite(str(folder / f"frame{picture.frame:06d}.png"), np.ascontiguousarray(drawn[..., ::-1]))
+
+
+def write_curves(folder: Path, results: Results) -> None:
+    """One PNG for each tag: IoU and CLE against frame number, all tracers together."""
+    try:
+        from .curves import score_curves
+    except ImportError:
+        warnings.warn(
+            "No curves were drawn: matplotlib is not installed. Install the viz extra: pip install 'tagjax[viz]'.",
+            stacklevel=2,
+        )
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    reference = next(iter(results.values()), ())
+    for number, one in enumerate(reference):
+        for epc, frames in one.frames.items():
+            lines = {}
+            for tracer, ones in results.items():
+                own = ones[number].frames[epc]
+                lines[tracer] = {
+                    "iou": np.where(own.detected, own.iou, 0.0),
+                    "cle_px": np.where(own.detected & own.visible, own.cle_px, np.nan),
+                }
+            name = _recording_name(reference, number)
+            offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
+            score_curves(folder / f"{name}_{epc}.png", lines, frames.valid, first_frame=offset, title=f"{name}: {epc}")
+
+
+def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
+    """The scores over all tags, one row a tracer."""
+    columns = {
+        "iou": "IoU",
+        "cle_px": "CLE px",
+        "mask_j": "J",
+        "identification": "identified",
+        "detected": "detected",
+        "locked": "locked",
+        "time_to_lock_s": "lock s",
+        "num_frames": "frames",
+    }
+    if any(scores["all"].get("false_detections") is not None for scores in summary.values()):
+        columns["false_detections"] = "false det."
+    rows = [[_cell(scores["all"].get(name)) for name in columns] for scores in summary.values()]
+    table = Table(title=title, box=SIMPLE, pad_edge=False, collapse_padding=True)
+    table.add_column("tracer", no_wrap=True)
+    for heading, *cells in zip(columns.values(), *rows, strict=True):
+        table.add_column(heading, justify="right", no_wrap=True, min_width=max(map(len, (heading, *cells))))
+    for tracer, row in zip(summary, rows, strict=True):
+        table.add_row(tracer, *row)
+    return table
+
+
+def _cell(value: float | int | None) -> str:
+    """Three significant digits; three decimal places below 1, so that columns stay narrow."""
+    if value is None:
+        return "-"
+    if isinstance(value, int):
+        return f"{value:d}"
+    return f"{value:.3f}" if 0 < abs(value) < 1 else f"{value:.3g}"
+
+
+def _recording_name(results: Sequence[RecordingResult], number: int) -> str:
+    """The recording's own name, numbered where several share it."""
+    names = [one.recording.name for one in results]
+    return names[number] if names.count(names[number]) == 1 else f"{names[number]}-{number}"

@@ -1,0 +1,180 @@
+"""Learned tracer parameters as plain numbers: one JSON file with the tracer's settings, the clip settings and the recipe.
+
+Nothing in a file is executed: it names numbers, which take the place of parameters that the tracer has already, and the
+clip settings of the training, with which the tracer is evaluated unless others are given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from . import TagAttention
+
+PACKAGED = Path(__file__).parent / "weights"
+"""Where the parameters that come with the package lie, as <name>.json."""
+
+_FORMAT = "tagjax-tracer-parameters"
+_VERSION = 2
+_LONGEST_TEXT = 1_000_000
+
+CLIP_NAMES = ("stride", "window", "flow", "estimator", "antennas")
+"""Clip settings that change a tracer's results; `max_reads` and `length` are sizes of buffers."""
+
+
+def packaged_parameters() -> tuple[str, ...]:
+    """Names of the parameters that come with the package."""
+    return tuple(sorted(path.stem for path in PACKAGED.glob("*.json")))
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """A file of learned parameters."""
+
+    path: Path
+    settings: Mapping[str, Any]  # of the tracer, with the values that learning began from
+    clips: Mapping[str, Any]  # clip settings of the training: stride, window, flow, estimator, antennas
+    parameters: Mapping[str, float]  # in physical units
+    default: bool  # whether `default` may mean this file
+
+    def unmoved(self) -> set[str]:
+        """Parameters that still have the value that learning began from."""
+        began = self.settings
+        return {name for name, value in self.parameters.items() if name in began and value == began[name]}
+
+
+def save_parameters(
+    path: str | Path,
+    tracer: TagAttention,
+    settings: Mapping[str, Any],
+    clips: Mapping[str, Any],
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a tracer's parameters in physical units.
+
+    `settings` are those that the tracer was built with, as under conf/tracer. `clips` are the clip settings of its training
+    that change its results (`CLIP_NAMES`); a flow in a file beside `path` is named relative to it. `about` is for people:
+    recipe, seed, data, scores.
+    """
+    path = Path(path)
+    chosen = {name: clips[name] for name in CLIP_NAMES if name in clips}
+    if isinstance(flow := chosen.get("flow"), str) and Path(flow).parent == path.parent:
+        chosen["flow"] = Path(flow).name
+    content = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "settings": _parameters_only(settings),
+        "clips": chosen,
+        "parameters": tracer.physical(),
+        "about": dict(about or {}),
+    }
+    beside = path.with_name(path.name + ".part")
+    beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(beside, path)
+
+
+def read_learned(source: str | Path, settings: Mapping[str, Any] | None = None) -> Learned:
+    """A file of `save_parameters`, packaged parameters by name, or `default`.
+
+    `default` means the packaged parameters that were learned from these tracer `settings`; without settings, those that are
+    the package's default. Raises `ValueError` where there are none, and for a file that is damaged or of another kind.
+    """
+    return _default_for(settings) if str(source) == "default" else _read(_find(source))
+
+
+def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[str, Any]) -> TagAttention:
+    """The tracer with learned parameters in place of its own; `source` and errors as of `read_learned`.
+
+    Raises `ValueError` also for parameters of another tracer, and where `settings` ask for other initial values than the
+    learning began from. A parameter that learning left unchanged may have any value.
+    """
+    found = read_learned(source, settings)
+    learned, unmoved = dict(found.parameters), found.unmoved()
+    for name, default in _learnable(tracer).items():
+        began, asked = (given.get(name, default) for given in (found.settings, settings))
+        if asked != began and name in unmoved:
+            learned[name] = asked
+        elif asked != began:
+            raise ValueError(
+                f"{found.path}: found tracer.{name}={asked!r}; expected {began!r}, from which these parameters were learned: "
+                f"the learned value would replace yours. Leave out {name}, or weights=."
+            )
+    try:
+        return tracer.with_physical(learned)
+    except ValueError as error:
+        raise ValueError(f"{found.path}: {error}") from error
+
+
+def _parameters_only(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name != "clips"}
+
+
+def _learnable(tracer: TagAttention) -> dict[str, Any]:
+    """The arguments of a tracer that are learned, with their defaults."""
+    static = {field.name for field in dataclasses.fields(tracer) if field.metadata.get("static", False)}
+    arguments = inspect.signature(type(tracer)).parameters.values()
+    return {argument.name: argument.default for argument in arguments if argument.name not in static}
+
+
+def _find(source: str | Path) -> Path:
+    if str(source) in packaged_parameters():
+        return PACKAGED / f"{source}.json"
+    if str(source).endswith(".json") and Path(source).is_file():
+        return Path(source)
+    there = ", ".join(packaged_parameters()) or "none"
+    raise ValueError(
+        f"No learned parameters at {str(source)!r}; expected the path of a .json file (a run folder's weights.json), "
+        f"`default`, or the name of packaged ones ({there})."
+    )
+
+
+def _default_for(settings: Mapping[str, Any] | None) -> Learned:
+    found = [one for name in packaged_parameters() if (one := _read(PACKAGED / f"{name}.json")).default]
+    for one in found:
+        if settings is None:
+            return one
+        unmoved = one.unmoved()
+        began, asked = (
+            {name: value for name, value in each.items() if name not in unmoved}
+            for each in (one.settings, _parameters_only(settings))
+        )
+        if began == asked:
+            return one
+    there = ", ".join(packaged_parameters()) or "none"
+    raise ValueError(
+        f"weights=default: no packaged parameters were learned from these settings of {(settings or {}).get('_target_')} "
+        f"(packaged are: {there}). Leave the settings at their defaults, or give a name or a file."
+    )
+
+
+def _read(path: Path) -> Learned:
+    try:
+        if path.stat().st_size > _LONGEST_TEXT:
+            raise ValueError(f"{path.stat().st_size} bytes")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: no learned parameters ({type(error).__name__}: {error}).") from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ValueError(f"{path}: found JSON, but no learned parameters; expected the format {_FORMAT}.")
+    if content.get("version") != _VERSION:
+        raise ValueError(f"{path}: version {content.get('version')!r}; this release reads {_VERSION}. Train again.")
+    parts = [content.get(name) for name in ("settings", "clips", "parameters")]
+    if not all(isinstance(part, dict) for part in parts):
+        raise ValueError(f"{path}: no settings, clips or parameters found; expected all three. Copy the file again.")
+    wrong = [name for name, value in content["parameters"].items() if not _is_number(value)]
+    if wrong:
+        raise ValueError(f"{path}: {', '.join(wrong)}: not a finite number. Train again.")
+    clips = dict(content["clips"])
+    if isinstance(flow := clips.get("flow"), str) and (path.parent / flow).is_file():
+        clips["flow"] = str(path.parent / flow)
+    return Learned(path, content["settings"], clips, content["parameters"], content.get("default", True))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,1 @@
+"""Tracers: the interface, clips of recordings as device arrays, and the loop over a recording."""

@@ -1,0 +1,99 @@
+"""The tracer interface, its inputs and outputs, and the scan that runs a tracer over a clip."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, UInt8
+
+from ..core.numerics import safe_norm
+from ..radio.reads import PhaseReads, RadioWindow
+
+
+class Camera(eqx.Module):
+    """The camera at the working resolution, and the antennas around it."""
+
+    rays: Float[Array, "height width 3"]  # ((x - cx) / fx, (y - cy) / fy, 1): point = depth * ray
+    antennas_m: Float[Array, "antenna 3"]  # their places, camera frame
+
+    def ranges_m(self, points_m: Float[Array, "*batch 3"]) -> Float[Array, " antenna *batch"]:
+        """Distances from points in the camera frame to each antenna, metres."""
+        return jax.vmap(lambda antenna: safe_norm(points_m - jnp.broadcast_to(antenna, points_m.shape)))(
+            self.antennas_m
+        )
+
+
+class BackwardMessage(eqx.Module):
+    """Evidence from all frames after one, for every tag: the backward pass of offline (two-pass) smoothing computes it."""
+
+    log_odds: Float[Array, "*time tag height width"]  # of object against background
+    anchor: eqx.Module  # (*time, tag, antenna, ...): range posterior of the tag at this frame
+    moved: Float[Array, "*time tag antenna"]  # evidence of later reads that the tag moves, nats
+
+
+class Frame(eqx.Module):
+    """The input of a tracer at one frame; in a clip every leaf has a leading time axis.
+
+    Flow at t is between frames t - 1 and t, pixels of the working resolution; it is zero at the first frame.
+    `backward_px` lies on the pixels of frame t and points to t - 1 (for gathering); `forward_px` lies on those of t - 1
+    and points to t (for splatting).
+    """
+
+    time_s: Float[Array, "*time"]
+    depth_m: Float[Array, "*time height width"]  # z, 0 = missing
+    backward_px: Float[Array, "*time height width 2"]
+    forward_px: Float[Array, "*time height width 2"]
+    radio: RadioWindow  # (*time, tag, antenna, window): causal, from reads up to this frame
+    reads: PhaseReads  # (*time, tag, antenna, read): the reads within this frame's window
+    colour: UInt8[Array, "*time rows columns 3"] | None = None  # full-size picture, for tracers that compute the flow
+    backward_message: BackwardMessage | None = None  # offline smoothing only
+
+
+class Trace(eqx.Module):
+    """The output of a tracer at one frame, for every tag; `trace` stacks it over time."""
+
+    mask: Float[Array, "*time tag height width"]  # soft mask, 0 to 1
+    box_px: Float[Array, "*time tag 4"]  # x0 y0 x1 y1, inclusive pixel indices, at the working resolution
+    centre_px: Float[Array, "*time tag 2"]  # x y of the mask's centroid
+    centre_m: Float[Array, "*time tag 3"]  # camera frame
+    step_m: Float[Array, "*time tag antenna"]  # change of the object's range to each antenna since the last frame
+    confidence: Float[Array, "*time tag"]  # 0 to 1
+    detected: Bool[Array, "*time tag"]  # the confidence exceeds the detection threshold
+
+
+class AbstractTracer(eqx.Module):
+    """A tracing system as a state machine of fixed shapes: `init`, one `step` a frame, `finish`."""
+
+    one_antenna: ClassVar[bool] = False
+    """Whether the method uses the range to a single antenna only."""
+
+    @abc.abstractmethod
+    def init(self, camera: Camera, frame: Frame) -> Any:
+        """The state before the first frame; only the shapes of `frame` (no time axis) are used."""
+
+    @abc.abstractmethod
+    def step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
+        """The next state, and the `Trace` of this frame."""
+
+    @abc.abstractmethod
+    def finish(self, state: Any) -> Any:
+        """The state from which a later part of the recording continues; it holds no reference to a past frame's buffer."""
+
+
+class AbstractSmoother(AbstractTracer):
+    """A tracer with a backward pass, whose messages the forward pass of offline smoothing uses."""
+
+    @abc.abstractmethod
+    def backward_step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, BackwardMessage]:
+        """`step` on the time-reversed recording: the next state, and the evidence from all frames after this one."""
+
+
+def trace(tracer: AbstractTracer, camera: Camera, clip: Frame) -> Trace:
+    """Run a tracer over a clip (leading time axis) with one `lax.scan`; the state has a fixed size."""
+    first = jax.tree.map(lambda leaf: leaf[0], clip)
+    _, out = jax.lax.scan(lambda state, frame: tracer.step(camera, state, frame), tracer.init(camera, first), clip)
+    return out

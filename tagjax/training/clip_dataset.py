@@ -1,0 +1,186 @@
+"""Training clips: which stretches of recordings are drawn, with which tags, and in which order."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..core.errors import RecordingError, RecordingWarning
+from ..core.stream import Stream
+from ..recording import Recording
+from ..tracing.clips import (
+    Antennas,
+    Clip,
+    Estimator,
+    check_clip,
+    choose_antennas,
+    load_clip,
+    selected_tags,
+    true_range_m,
+)
+from ..tracing.motion_evidence import coherence_loss
+
+_PIECE_S = 0.5
+"""In pieces of this length a clip's reads are asked for motion."""
+
+
+def motion_heard(
+    recording: Recording, starts: Sequence[int], length: int, epcs: Sequence[str], antennas: Sequence[int]
+) -> np.ndarray:
+    """How much each tag moves in each clip, by its reads alone: (clips, tags), of the antenna that tells most.
+
+    The mean over a clip's pieces of half a second of the coherence that reads, modulo pi, lose by taking the tag to rest
+    (`tagjax.tracing.motion_evidence`): some 0.02 by noise where nothing moves, 0.2 to 0.6 where a hand waves.
+    """
+    time_s = recording.frame_time_s()
+    edges = np.arange(time_s[0], time_s[-1] + _PIECE_S, _PIECE_S)
+    most = np.zeros((len(starts), len(epcs)))
+    for (tag, epc), antenna in itertools.product(enumerate(epcs), antennas):
+        reads = recording.reads.select(epc)
+        lost = coherence_loss(reads[reads.antenna == antenna], edges, int(recording.time_ns[0]))
+        for number, start in enumerate(starts):
+            first, last = np.searchsorted(edges, time_s[[start, start + length - 1]], side="right") - 1
+            most[number, tag] = max(most[number, tag], lost[first : last + 1].mean())
+    return most
+
+
+def _drawn_tags(heard: np.ndarray, max_tags: int | None, seed: tuple[int, ...]) -> list[int]:
+    """The number of the tag that is heard to move most, and of the others as many as there is room for, by chance."""
+    moving = int(heard.argmax())
+    others = np.random.default_rng(seed).permutation(np.delete(np.arange(len(heard)), moving))
+    return sorted([moving, *others.tolist()][:max_tags])
+
+
+class _ClipSource:
+    """Every clip of `length` frames that starts on a multiple of `step`, as Grain's random access source.
+
+    Of these only clips in which the radio hears some tag move, by `min_motion` or more (`motion_heard`), each with
+    `max_tags` of its tags. Warns (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for those
+    of which no clip can be loaded, which would else be found when the first one is drawn.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        length: int,
+        step: int,
+        on_host: bool,
+        epcs: Sequence[str] | None = None,
+        min_motion: float = 0.0,
+        max_tags: int | None = None,
+        **settings: Any,
+    ):
+        self._recordings, self._length, self._settings = list(recordings), length, settings
+        self._on_host = on_host  # NumPy arrays, which one process can hand to another
+        self._places: list[tuple[int, int, tuple[str, ...], tuple[int, ...]]] = []
+        if all(recording.num_frames < length for recording in recordings):
+            longest = max((recording.num_frames for recording in recordings), default=0)
+            raise RecordingError(
+                f"No clip of {length} frames in {len(self._recordings)} recordings (the longest has {longest} frames). "
+                "Ask for shorter clips or give longer recordings."
+            )
+        most_heard = 0.0
+        for number, recording in enumerate(recordings):
+            if recording.num_frames < length:
+                warnings.warn(
+                    f"{recording.name} has {recording.num_frames} frames, fewer than a clip's {length}: it gives no clip. "
+                    "Ask for shorter clips to use it.",
+                    RecordingWarning,
+                    stacklevel=3,
+                )
+                continue
+            named = selected_tags(recording, epcs)
+            chosen = choose_antennas(recording, named, settings["antennas"])
+            if settings["estimator"] == "truth":
+                for epc, antenna in itertools.product(named, chosen):
+                    true_range_m(recording, epc, antenna)
+            starts = range(0, recording.num_frames - length + 1, step)
+            heard = motion_heard(recording, starts, length, named, chosen)
+            for start, of_tags in zip(starts, heard, strict=True):
+                if of_tags.max() >= min_motion:
+                    drawn = _drawn_tags(of_tags, max_tags, (number, start))
+                    self._places.append((number, start, tuple(named[tag] for tag in drawn), chosen))
+            most_heard = max(most_heard, float(heard.max()))
+        if not self._places:
+            raise RecordingError(
+                f"In no clip of {length} frames is a tag heard to move by {min_motion} or more (the most is "
+                f"{most_heard:.3f}; noise alone makes about 0.02): there is nothing to learn motion from. Give recordings "
+                "in which tags move and are read, or set data.clips.min_motion lower."
+            )
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index) -> Clip:
+        number, start, epcs, antennas = self._places[int(index)]
+        settings: dict[str, Any] = {**self._settings, "antennas": antennas}  # of all its tags, whichever were drawn
+        clip = load_clip(self._recordings[number], start, start + self._length, epcs=epcs, **settings)
+        return jax.tree.map(np.asarray, clip) if self._on_host else clip
+
+
+def _on_device(clip: Clip) -> Clip:
+    return jax.tree.map(jnp.asarray, clip)
+
+
+def clip_dataset(
+    recordings: Sequence[Recording],
+    *,
+    clip_length: int,
+    stride: int,
+    seed: int,
+    epcs: Sequence[str] | None = None,
+    flow: str = "dis",
+    window: int = 5,
+    max_reads: int = 64,
+    estimator: Estimator = "robust",
+    antennas: Antennas = None,
+    colour: bool = False,
+    step: int | None = None,
+    min_motion: float = 0.0,
+    max_tags: int | None = None,
+    workers: int = 0,
+    share: tuple[int, int] = (0, 1),
+) -> Stream:
+    """An endless, shuffled stream of clips; the same seed gives the same order.
+
+    Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None);
+    those in which no tag is heard to move by `min_motion` (`motion_heard`) are not drawn, and of a clip's tags
+    `max_tags` are, all if None: the one that is heard to move most and some of the others, the same each time. With
+    `workers` as many processes load them, radio included, and this one only takes them to its device; `share` (i, n) is
+    every n-th clip from the i-th on. Warns (`RecordingWarning`) of recordings shorter than a clip; raises
+    `RecordingError` if all are, and for an unknown EPC or antenna of any other; `ValueError` for settings that no clip
+    can have.
+    """
+    check_clip(stride=stride, window=window, max_reads=max_reads)
+    for name, found, unit in (
+        ("clip_length", clip_length, "frame"),
+        ("step", step, "frame"),
+        ("max_tags", max_tags, "tag"),
+    ):
+        if found is not None and found < 1:
+            raise ValueError(f"{name} is {found}; expected at least 1 {unit}.")
+    source = _ClipSource(
+        recordings,
+        clip_length,
+        step or max(1, clip_length // 2),
+        workers > 0,
+        epcs,
+        min_motion,
+        max_tags,
+        stride=stride,
+        flow=flow,
+        window=window,
+        max_reads=max_reads,
+        estimator=estimator,
+        antennas=antennas,
+        colour=colour,
+    )
+    dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()
+    return Stream(dataset, workers=workers, share=share, finish=_on_device if workers else None)
