@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy import stats
 
 LEVEL = 0.95
@@ -25,16 +25,13 @@ class Estimate:
     num_recordings: int  # that have such a frame
 
 
-def ratio_estimate(totals: Sequence[float], counts: Sequence[int]) -> Estimate:
+def ratio_estimate(totals: Float[np.ndarray, " recording"], counts: Int[np.ndarray, " recording"]) -> Estimate:
     """sum(totals) / sum(counts), one element a recording, with its percentile bootstrap interval.
 
     The interval holds the middle 95 % of the values that 2,000 draws of as many recordings, with replacement, give. Always
     the same draws: the same recordings have the same interval. Recordings with a count of 0 are left out.
     """
-    total, count = np.asarray(totals, np.float64), np.asarray(counts, np.int64)
-    if total.shape != count.shape or total.ndim != 1:
-        raise ValueError(f"found totals of {total.shape} and counts of {count.shape}; expected one each a recording.")
-    total, count = total[count > 0], count[count > 0]
+    total, count = totals[counts > 0], counts[counts > 0]
     if not len(count):
         return Estimate(None, None, None, 0.0, 0, 0)
     value, low, high = float(total.sum() / count.sum()), None, None

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...core.machine import machine
 from ...report.report import write_json
 from .interval import LEVEL, NUM_RESAMPLES, SEED, ratio_estimate
@@ -74,13 +76,7 @@ def _cell(
     if job is None:
         return None
     found = scores[job]
-    values = {
-        measure: dataclasses.asdict(
-            ratio_estimate(*zip(*(one.sums.get(measure, (0.0, 0)) for one in found), strict=True))
-        )
-        for measure in column.measures
-        if measure not in COUNTS
-    }
+    values = {measure: _estimate(measure, found) for measure in column.measures if measure not in COUNTS}
     return {
         "kind": "score",
         "job": job.name,
@@ -89,6 +85,13 @@ def _cell(
         "num_tags": sum(one.num_tags for one in found),
         "num_frames": sum(one.num_frames for one in found),
     }
+
+
+def _estimate(measure: str, scores: Sequence[RecordingScores]) -> dict[str, Any]:
+    """A measure's mean with its interval."""
+    sums = [one.sums.get(measure, (0.0, 0)) for one in scores]
+    totals, counts = np.array([one[0] for one in sums], np.float64), np.array([one[1] for one in sums], np.int64)
+    return dataclasses.asdict(ratio_estimate(totals, counts))
 
 
 def write_table(path: Path, table: Mapping[str, Any]) -> None:
