@@ -24,7 +24,7 @@ def main(config: DictConfig) -> None:
     from rich.console import Console
 
     from tagjax.core.settings import from_mapping
-    from tagjax.sim.contact_sheet import save_glance, save_sheet
+    from tagjax.sim.contact_sheet import save_preview, save_sheet
     from tagjax.sim.suites import SimulateConfig, Suite, make_suite
 
     from .progress import counting_bar
@@ -39,7 +39,7 @@ def main(config: DictConfig) -> None:
     suite = suite.smoke() if checked.smoke else suite
     console = Console()
     if sheets is not None:
-        console.print(f"{suite.name}: {save_glance(suite, Path(sheets), workers=checked.workers or 1)}")
+        console.print(f"{suite.name}: {save_preview(suite, Path(sheets), workers=checked.workers or 1)}")
         return
     total = len(suite.items())
     with counting_bar(console, shown=checked.progress) as bar:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -64,6 +66,21 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder} (set TAGJAX_REAL_DATA)")
     return folder.resolve()
+
+
+@pytest.fixture(scope="session")
+def small_walkers():
+    """A recording of the suite `walkers` in small (160 pixels wide, 2.4 s), with exact flow in its truth."""
+    pytest.importorskip("mujoco")
+    from tagjax.core.settings import from_mapping
+    from tagjax.sim.record import simulate_recording
+    from tagjax.sim.suites import Suite, item_scenario
+
+    settings = yaml.safe_load((Path(__file__).parents[1] / "conf" / "benchmark" / "walkers.yaml").read_text())
+    suite = from_mapping(Suite, settings, where="suite").smoke()
+    capture = dataclasses.replace(suite.capture, width=160, frame_rate_hz=10.0, flow=True)
+    (item,) = suite.items()
+    return simulate_recording(item_scenario(item), capture, seed=item.seed, name=item.name)
 
 
 def check_gradients(function, arguments, *, atol: float = 1e-6, rtol: float = 1e-5, step: float = 1e-6) -> None:

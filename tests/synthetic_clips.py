@@ -191,7 +191,7 @@ class SmallTracer(AbstractTracer):
             centre_m=jnp.zeros((num_tags, 3)),
             step_m=(jnp.sum(mask * change[None], axis=(1, 2)) / (total + 1e-6))[:, None],
             confidence=jnp.max(mask, axis=(1, 2)),
-            found=jnp.any(mask > 0.5, axis=(1, 2)),
+            detected=jnp.any(mask > 0.5, axis=(1, 2)),
         )
 
     def finish(self, state: SmallState) -> SmallState:

@@ -148,7 +148,7 @@ def test_false_alarms_are_claims_of_tags_that_lie_still_labelled_or_not(monkeypa
             centre_m=jnp.zeros((4, 3)),
             step_m=jnp.zeros((4, 1)),
             confidence=jnp.full(4, 0.45),  # a claim counts alike in P_D and P_FA, whatever it is worth
-            found=jnp.array([claimed[one] for one in order]),
+            detected=jnp.array([claimed[one] for one in order]),
         )
 
     config = _config(["occlusion"])
@@ -159,7 +159,7 @@ def test_false_alarms_are_claims_of_tags_that_lie_still_labelled_or_not(monkeypa
     scores = dataclasses.replace(config.scores, moved_for_s=0.0, min_pixels=2)
     _score(systems, "tagview", item, recording, scores, tally)
     assert np.mean(np.concatenate(tally.still)) == pytest.approx(3 / num)
-    assert tally.scores.result()["false_claims"] == pytest.approx((3 + num) / (2 * num))
+    assert tally.scores.result()["false_detections"] == pytest.approx((3 + num) / (2 * num))
 
 
 def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -18,7 +18,7 @@ from tagjax.tracing.clips import ClipSettings
 from tagjax.training.config import TrainConfig
 from tagjax.training.loop import LoopSettings
 from tagjax.training.loss import ObjectiveSettings
-from tagjax.training.sources import DataSettings, SimulateSettings
+from tagjax.training.sources import DataSettings
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -60,7 +60,7 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"data": {"virtual_tag": {"seeds": []}}}, r"data\.virtual_tag: seeds is empty; expected at least one"),
         ({"scores": {"tags_at_once": 0}}, r"scores: tags_at_once is 0; expected at least 1"),
         ({"scores": {"frames_at_once": -1}}, r"scores: frames_at_once is -1; expected at least 1"),
-        ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a share from 0 to 1"),
+        ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a value from 0 to 1"),
         ({"scores": {"frames": [9, 3]}}, r"scores: frames is \[9, 3\]; expected \[from, to\]"),
     ],
 )
@@ -140,7 +140,6 @@ def _written(path: str) -> dict[str, Any]:
         ("objective/coherent.yaml", None, ObjectiveSettings),
         ("data/default.yaml", None, DataSettings),
         ("data/default.yaml", "clips", ClipSettings),
-        ("data/default.yaml", "simulate", SimulateSettings),
         ("data/default.yaml", "virtual_tag", VirtualTagSettings),
         ("train.yaml", "scores", ScoreSettings),
         ("scores/default.yaml", None, ScoreSettings),

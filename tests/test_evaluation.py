@@ -100,18 +100,18 @@ def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
             centre_m=jnp.zeros((3, 3)),
             step_m=jnp.zeros((3, 1)),
             confidence=jnp.ones(3),
-            found=jnp.array([True, False, claimed]),
+            detected=jnp.array([True, False, claimed]),
         )
 
     traces = [(number, said(number in (3, 4, 9))) for number in range(12)]
     result = score_traces(traces, recording, names)
     scores = result.scores().result()
-    assert scores["false_claims"] == pytest.approx(3 / 12)
+    assert scores["false_detections"] == pytest.approx(3 / 12)
     of_labelled = [tag.result() for tag in result.tag_scores().values()]
     assert scores["num_frames"] == sum(tag["num_frames"] or 0 for tag in of_labelled)
-    assert all("false_claims" not in tag for tag in of_labelled)
+    assert all("false_detections" not in tag for tag in of_labelled)
     blind = dataclasses.replace(recording, truth=None)
-    assert "false_claims" not in score_traces(traces, blind, names).scores().result()
+    assert "false_detections" not in score_traces(traces, blind, names).scores().result()
 
 
 def test_without_truth_there_are_pictures_but_no_scores() -> None:
@@ -200,7 +200,9 @@ def test_report_is_complete(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * 30
     by_hand = [
-        float(r["iou"]) for r in rows if r["tracer"] == "blunt" and r["shown"] == r["moved"] == r["found"] == "1"
+        float(r["iou"])
+        for r in rows
+        if r["tracer"] == "blunt" and r["visible"] == r["has_moved"] == r["detected"] == "1"
     ]
     assert summary["blunt"]["all"]["iou"] == pytest.approx(np.sum(by_hand) / summary["blunt"]["all"]["num_frames"])
     pictures = sorted((tmp_path / "overlays" / "synthetic" / "learned").glob("*.png"))

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tagjax.image.warp import gather, pixel_grid
-from tagjax.sim import _layers as geometry
-from tagjax.sim._random_scene import draw_scene
 from tagjax.sim.flow_pairs import FlowPairSettings, flow_pair, flow_pairs
+from tagjax.sim.flow_pairs import layers as geometry
+from tagjax.sim.flow_pairs.random_scenes import draw_scene
 
 NOISY = FlowPairSettings(height=48, width=64, num_layers=(1, 4), radius_px=(5.0, 20.0),
-                         still_scene_share=0.2)  # fmt: skip
-CLEAN = dataclasses.replace(NOISY, lighting_share=0.0, blur_px=0.0, noise=0.0)
+                         static_scene_probability=0.2)  # fmt: skip
+CLEAN = dataclasses.replace(NOISY, lighting_change_probability=0.0, blur_px=0.0, noise=0.0)
 BATCH = 24
 
 
@@ -183,7 +183,7 @@ def test_light_noise_and_photographs_change_the_pictures_and_not_the_flow(pairs)
     again = jax.device_get(flow_pairs(NOISY, BATCH, photographs, key=jax.random.key(1)))
     for a, b in zip(jax.tree.leaves(noisy), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
-    # No two keys share a picture.
+    # Different keys give different pictures.
     assert len({a.tobytes() for a in noisy.first}) == BATCH
 
 
@@ -227,7 +227,7 @@ def test_motion_is_mostly_small_partly_zero_and_sometimes_large():
         ({"height": 8}, "too small"),
         ({"num_layers": (0, 3)}, "num_layers"),
         ({"num_layers": (4, 3)}, "num_layers"),
-        ({"bend_share": 1.5}, "bend_share.*probability"),
+        ({"bend_probability": 1.5}, "bend_probability.*probability"),
         ({"motion_px": (0.0, 3.0)}, "motion_px.*log-uniform"),
         ({"radius_px": (9.0, 3.0)}, "radius_px"),
         ({"noise": -0.1}, "noise.*at least 0"),
@@ -235,6 +235,6 @@ def test_motion_is_mostly_small_partly_zero_and_sometimes_large():
         ({"camera_tilt": 0.5}, "camera_tilt.*degenerate"),
     ],
 )
-def test_settings_that_make_no_picture_are_refused(change, words):
+def test_impossible_settings_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
         dataclasses.replace(NOISY, **change)

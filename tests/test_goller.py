@@ -1152,7 +1152,7 @@ def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
     assert told[_beyond_the_line(straight((4.6, 0.3), (-1.6, 0.3)))].all()
     for frame, trace in said:
         best = int(np.argmax(probability[leaver, frame]))
-        assert bool(trace.found[leaver]) == (best > 0)
+        assert bool(trace.detected[leaver]) == (best > 0)
         if best:
             np.testing.assert_allclose(trace.confidence[leaver], probability[leaver, frame, best], atol=1e-4)
             truth = np.asarray(shop.truth.labels[frame]) == 1
@@ -1162,7 +1162,7 @@ def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
             assert place[2] == pytest.approx(0.85, abs=0.01)
     assert len(overlap) == told.sum()
     assert np.mean(overlap[3:-10]) > 0.7
-    assert not any(trace.found[seen.epcs.index("shelf")] for _, trace in said[10:])
+    assert not any(trace.detected[seen.epcs.index("shelf")] for _, trace in said[10:])
 
 
 def test_a_tracer_without_commissioning_learns_the_background_itself(calibration):
@@ -1171,7 +1171,7 @@ def test_a_tracer_without_commissioning_learns_the_background_itself(calibration
     recording = drawn_shop({"a": walk}, {})
     settings = dataclasses.replace(LOOKING_DOWN, blobs=dataclasses.replace(LOOKING_DOWN.blobs, warm_up="online"))
     tracer = GollerTracer(calibration, settings, site=find_site(recording))
-    assert sum(bool(trace.found[0]) for _, trace in host_trace(tracer, recording)) > 15
+    assert sum(bool(trace.detected[0]) for _, trace in host_trace(tracer, recording)) > 15
 
 
 def test_a_state_is_stepped_once_and_depth_is_refused(shop, calibration):

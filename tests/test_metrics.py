@@ -60,9 +60,9 @@ def test_most_covered_is_by_part_not_by_pixels() -> None:
     labels[:10], labels[10:15, :10] = 1, 2
     mask = np.zeros((20, 20), dtype=bool)
     mask[5:15, :10] = True  # 50 of 200 pixels of object 1, all 50 of object 2
-    assert metrics.most_covered(mask, labels) == 2
-    assert metrics.most_covered(mask, labels, min_pixels=60) == 1
-    assert metrics.most_covered(np.zeros_like(mask), labels) == 0
+    assert metrics.best_covered_label(mask, labels) == 2
+    assert metrics.best_covered_label(mask, labels, min_pixels=60) == 1
+    assert metrics.best_covered_label(np.zeros_like(mask), labels) == 0
 
 
 def test_label_box_and_border() -> None:
@@ -71,7 +71,7 @@ def test_label_box_and_border() -> None:
     box = metrics.label_box(labels, 4)
     np.testing.assert_array_equal(box, [3, 2, 7, 4])
     assert np.isnan(metrics.label_box(labels, 1)).all()
-    area = metrics.known_area(labels)
+    area = metrics.labelled_area(labels)
     np.testing.assert_array_equal(area, [0, 0, 11, 9])
     assert not metrics.touches_border(box, area, margin_px=1.0)
     assert metrics.touches_border(box, area, margin_px=2.0)  # y0 = 2
@@ -79,8 +79,8 @@ def test_label_box_and_border() -> None:
     assert metrics.touches_border(np.array([3, 0, 7, 4.0]), area)
     # Where depth does not reach the edge of the picture, the labels' own edge counts.
     labels[:, :3] = labels[:2] = Truth.IGNORE
-    np.testing.assert_array_equal(metrics.known_area(labels), [3, 2, 11, 9])
-    assert metrics.touches_border(box, metrics.known_area(labels))
+    np.testing.assert_array_equal(metrics.labelled_area(labels), [3, 2, 11, 9])
+    assert metrics.touches_border(box, metrics.labelled_area(labels))
 
 
 def test_time_to_lock_skips_invalid_frames() -> None:
@@ -128,9 +128,9 @@ def _frames(iou: list[float], found: list[bool], identified: list[int]) -> Frame
         mask_j=np.array(iou),
         identified=np.array(identified),
         confidence=np.ones(n),
-        found=np.array(found),
-        shown=np.array([True] * (n - 1) + [False]),
-        moved=np.array([False] + [True] * (n - 1)),
+        detected=np.array(found),
+        visible=np.array([True] * (n - 1) + [False]),
+        has_moved=np.array([False] + [True] * (n - 1)),
         label=2,
     )
 
@@ -141,7 +141,7 @@ def test_scores_select_frames_and_punish_missing_claims() -> None:
     assert result["num_frames"] == 3  # frames 1, 2 and 3
     assert result["iou"] == pytest.approx((0.8 + 0.6 + 0.0) / 3)
     assert result["identification"] == pytest.approx(1 / 3)
-    assert result["found"] == pytest.approx(2 / 3)
+    assert result["detected"] == pytest.approx(2 / 3)
     assert result["cle_px"] == pytest.approx(7.0)
     assert result["time_to_lock_s"] == 0.0
 

@@ -23,7 +23,7 @@ from tagjax.radio.reads import PhaseReads
 from tagjax.radio.refine import interpolation_weights
 from tagjax.radio.unwrap import remove_jump, unwrap_paper
 from tagjax.recording import TagReads
-from tagjax.tracing.motion_evidence import MIN_READS, coherence_lost
+from tagjax.tracing.motion_evidence import MIN_READS
 from tagjax.tracing.range_windows import (
     paper_windows,
     phase_reads,
@@ -560,7 +560,7 @@ def test_coherence_lost_by_rest_is_that_of_the_reads_modulo_pi() -> None:
         rssi_dbm=np.full(count, -50, np.float32),
         doppler_hz=np.full(count, np.nan, np.float32),
     )
-    lost = coherence_lost(reads, edges, 7_000_000_000)
+    lost = coherence_loss(reads, edges, 7_000_000_000)
     channel = np.unique(np.stack([reads.antenna, carrier_hz]), axis=1, return_inverse=True)[1]
     time_s = (reads.time_ns - 7_000_000_000) * 1e-9
     for piece, (begin, end) in enumerate(itertools.pairwise(edges)):
@@ -573,6 +573,6 @@ def test_coherence_lost_by_rest_is_that_of_the_reads_modulo_pi() -> None:
         assert lost[piece] == pytest.approx(1.0 - float(found) if piece < 3 else 0.0, abs=1e-5)
     # Flips lose nothing, noise of sigma rad about 2 sigma^2 and a wave of a hand nearly all.
     assert 0.15 < lost[2] < 2 * 0.4**2 + 0.02
-    assert not coherence_lost(TagReads.empty(), edges, 0).any()
+    assert not coherence_loss(TagReads.empty(), edges, 0).any()
     wave = dataclasses.replace(reads, phase_rad=np.mod(4 * np.pi * 0.15 * np.sin(2 * np.pi * time_s) / 0.33, 2 * np.pi))
-    assert coherence_lost(wave, edges, 7_000_000_000)[:3].min() > 0.6
+    assert coherence_loss(wave, edges, 7_000_000_000)[:3].min() > 0.6

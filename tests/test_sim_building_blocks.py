@@ -5,18 +5,26 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tagjax.sim import motion
-from tagjax.sim._crowd import BODY_RADIUS_M, distance_to
-from tagjax.sim._rotation import frame, multiply, quaternion_of, turn_about
-from tagjax.sim.objects import OBJECT_KINDS, bounds, make_object
-from tagjax.sim.people import Hands, carried, hand_path, hold, make_person, move_person, person_bodies
-from tagjax.sim.rooms import ROOMS, make_room
-from tagjax.sim.world import STEP_S, World, rotation_matrix
+from tagjax.sim.world import trajectory, walks
+from tagjax.sim.world.bodies import STEP_S, World, rotation_matrix
+from tagjax.sim.world.crowd import BODY_RADIUS_M, distance_to
+from tagjax.sim.world.objects import OBJECT_KINDS, bounds, make_object
+from tagjax.sim.world.people import (
+    Hands,
+    carried_poses,
+    hand_path,
+    hand_target,
+    make_person,
+    move_person,
+    person_bodies,
+)
+from tagjax.sim.world.rooms import ROOMS, make_room
+from tagjax.sim.world.rotation import frame, multiply, quaternion_of, turn_about
 
 
 def straight(speed, length=6.0):
-    return motion.walk_along(
-        motion.path_through([[0, 0, 0], [length, 0, 0]], speed_m_s=speed, max_acceleration_m_s2=1.5)
+    return walks.walk_along(
+        trajectory.path_through([[0, 0, 0], [length, 0, 0]], speed_m_s=speed, max_acceleration_m_s2=1.5)
     )
 
 
@@ -35,73 +43,73 @@ def test_path_keeps_its_bounds_and_passes_its_points(seed):
     rng = np.random.default_rng(seed)
     points = rng.uniform(-2, 2, (int(rng.integers(2, 7)), 3))
     speed, acceleration = rng.uniform(0.2, 3), rng.uniform(0.5, 10)
-    path = motion.path_through(points, speed_m_s=speed, max_acceleration_m_s2=acceleration)
-    assert motion.max_speed(path) <= speed * 1.001
-    assert motion.max_acceleration(path) <= acceleration
+    path = trajectory.path_through(points, speed_m_s=speed, max_acceleration_m_s2=acceleration)
+    assert trajectory.max_speed(path) <= speed * 1.001
+    assert trajectory.max_acceleration(path) <= acceleration
     assert max(np.linalg.norm(path - point, axis=-1).min() for point in points) <= 0.5 * speed * STEP_S + 1e-3
     np.testing.assert_allclose(path[[0, -1]], points[[0, -1]], atol=1e-9)
 
 
 def test_straight_path_is_a_trapezium():
-    path = motion.path_through([[0, 0, 0], [3, 4, 0]], speed_m_s=1.25, max_acceleration_m_s2=2.0)
-    assert motion.max_speed(path) == pytest.approx(1.25, rel=1e-6)
+    path = trajectory.path_through([[0, 0, 0], [3, 4, 0]], speed_m_s=1.25, max_acceleration_m_s2=2.0)
+    assert trajectory.max_speed(path) == pytest.approx(1.25, rel=1e-6)
     # 1.5 m/s^2 (0.75 of the bound) up and down: length / speed + speed / acceleration.
     assert (len(path) - 1) * STEP_S == pytest.approx(5 / 1.25 + 1.25 / 1.5, abs=2 * STEP_S)
 
 
-def test_timed_path_is_at_its_points_in_time_or_says_what_it_needs():
+def test_timed_path_passes_its_points_in_time_or_is_refused():
     points, times = [[0, 0, 1], [0.5, 0.2, 1], [1.0, 0, 1.2]], [0, 1.0, 2.0]
-    path = motion.path_through(points, times_s=times, max_acceleration_m_s2=4.0)
+    path = trajectory.path_through(points, times_s=times, max_acceleration_m_s2=4.0)
     np.testing.assert_allclose(path[[0, 100, 200]], points, atol=1e-9)
-    with pytest.raises(ValueError, match="stretch them"):
-        motion.path_through(points, times_s=[0, 0.2, 0.4], max_acceleration_m_s2=4.0)
+    with pytest.raises(ValueError, match="Multiply them"):
+        trajectory.path_through(points, times_s=[0, 0.2, 0.4], max_acceleration_m_s2=4.0)
 
 
 @pytest.mark.parametrize("kind", ["line", "circle", "eight", "random"])
 @pytest.mark.parametrize("speed", [0.3, 1.0, 2.5])
-def test_wave_has_the_asked_peak_speed_and_rests_at_both_ends(kind, speed):
-    path = motion.wave(kind, (1, 2, 1), 6.0, peak_speed_m_s=speed, rng=np.random.default_rng(3))
-    assert motion.max_speed(path) == pytest.approx(speed, rel=1e-9)
-    assert motion.max_acceleration(path) <= 12.0
+def test_wave_has_the_given_peak_speed_and_zero_speed_at_both_ends(kind, speed):
+    path = trajectory.wave(kind, (1, 2, 1), 6.0, peak_speed_m_s=speed, rng=np.random.default_rng(3))
+    assert trajectory.max_speed(path) == pytest.approx(speed, rel=1e-9)
+    assert trajectory.max_acceleration(path) <= 12.0
     np.testing.assert_allclose(path[[0, 1, -2, -1]], np.broadcast_to([1, 2, 1], (4, 3)), atol=1e-4)
 
 
 def test_impossible_motions_are_refused():
     with pytest.raises(ValueError, match="slow it down"):
-        motion.wave("line", (0, 0, 0), 5.0, peak_speed_m_s=2.5, amplitude_m=0.1)
+        trajectory.wave("line", (0, 0, 0), 5.0, peak_speed_m_s=2.5, amplitude_m=0.1)
     with pytest.raises(ValueError, match="same"):
-        motion.path_through([[0, 0, 0], [0, 0, 0]], speed_m_s=1.0)
+        trajectory.path_through([[0, 0, 0], [0, 0, 0]], speed_m_s=1.0)
     with pytest.raises(ValueError, match="meet"):
-        motion.join(motion.rest((0, 0, 0), 1.0), motion.rest((1, 0, 0), 1.0))
+        trajectory.join(trajectory.stay_at((0, 0, 0), 1.0), trajectory.stay_at((1, 0, 0), 1.0))
     with pytest.raises(ValueError, match="more than"):
-        motion.still_then_move(motion.rest((0, 0, 0), 2.0), 1.0, 2.0)
+        trajectory.wait_then_move(trajectory.stay_at((0, 0, 0), 2.0), 1.0, 2.0)
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.5])
-def test_still_then_move(speed):
-    run = motion.path_through([[0, 0, 1], [3, 0, 1]], speed_m_s=speed, max_acceleration_m_s2=6.0)
-    path = motion.still_then_move(run, 1.5, 10.0)
-    assert len(path) == motion.num_steps(10.0)
-    assert motion.max_speed(path[:151]) == 0
-    assert motion.max_speed(path) == pytest.approx(speed, rel=1e-3)
-    assert motion.max_acceleration(path) <= 6.0
+def test_wait_then_move(speed):
+    run = trajectory.path_through([[0, 0, 1], [3, 0, 1]], speed_m_s=speed, max_acceleration_m_s2=6.0)
+    path = trajectory.wait_then_move(run, 1.5, 10.0)
+    assert len(path) == trajectory.num_steps(10.0)
+    assert trajectory.max_speed(path[:151]) == 0
+    assert trajectory.max_speed(path) == pytest.approx(speed, rel=1e-3)
+    assert trajectory.max_acceleration(path) <= 6.0
 
 
 @pytest.mark.parametrize("name", ["meeting_room", "office", "shop_floor"])
-def test_walkers_keep_apart_and_out_of_furniture(name):
+def test_walkers_keep_their_distance_to_each_other_and_to_furniture(name):
     rng = np.random.default_rng(5)
     room = make_room(name, rng)
     num = 2 if name == "shop_floor" else 3
-    walks = motion.random_walks(
+    people = walks.random_walks(
         num, 8.0, rng, area_m=room.walk_area_m, obstacles_m=room.obstacles_m, door=room.door, num_door=bool(room.door)
     )
-    place = np.stack([walk.position_m for walk in walks], axis=1)
+    place = np.stack([walk.position_m for walk in people], axis=1)
     gap = np.linalg.norm(place[:, :, None] - place[:, None], axis=-1)[:, ~np.eye(num, dtype=bool)]
     assert gap.min() >= 0.6
     assert min(distance_to(box, place)[0].min() for box in room.obstacles_m) > BODY_RADIUS_M - 0.06
-    for walk in walks:
-        assert motion.max_acceleration(walk.position_m) <= motion.MAX_ACCELERATION_M_S2 + 1e-9
-        assert 0.3 < motion.max_speed(walk.position_m) <= 1.4 + 1e-9
+    for walk in people:
+        assert trajectory.max_acceleration(walk.position_m) <= walks.MAX_ACCELERATION_M_S2 + 1e-9
+        assert 0.3 < trajectory.max_speed(walk.position_m) <= 1.4 + 1e-9
     if room.door is not None:
         np.testing.assert_allclose(place[0, 0], room.door.outside_m[0])
         x0, y0, x1, y1 = room.walk_area_m
@@ -110,13 +118,13 @@ def test_walkers_keep_apart_and_out_of_furniture(name):
 
 def test_walkers_without_room_are_refused():
     with pytest.raises(ValueError, match="No free place"):
-        motion.random_walks(9, 1.0, np.random.default_rng(0), area_m=(0.0, 0.0, 1.0, 1.0))
+        walks.random_walks(9, 1.0, np.random.default_rng(0), area_m=(0.0, 0.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="through a door"):
-        motion.random_walks(2, 1.0, np.random.default_rng(0), area_m=(0.0, 0.0, 4.0, 4.0), num_door=1)
+        walks.random_walks(2, 1.0, np.random.default_rng(0), area_m=(0.0, 0.0, 4.0, 4.0), num_door=1)
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.3, 2.0])
-def test_feet_stand_still_and_legs_hold_together(speed):
+def test_standing_feet_do_not_slide_and_legs_stay_connected(speed):
     model = make_person(np.random.default_rng(1))
     walk = straight(speed)
     person = move_person(model, walk)
@@ -128,9 +136,9 @@ def test_feet_stand_still_and_legs_hold_together(speed):
         np.testing.assert_allclose(person.limbs[f"{side} shin"].position_m, ankle, atol=2e-3)
         np.testing.assert_allclose(np.linalg.norm(knee - ankle, axis=-1), m.shin, atol=2e-3)
         assert ankle[:, 2].min() > 0.9 * m.ankle
-        assert motion.max_speed(ankle) < 5 * speed + 1.0
-        resting = np.linalg.norm(np.diff(ankle, axis=0), axis=-1).min()
-        assert resting < 1e-9
+        assert trajectory.max_speed(ankle) < 5 * speed + 1.0
+        slowest = np.linalg.norm(np.diff(ankle, axis=0), axis=-1).min()
+        assert slowest < 1e-9
     hips = person.limbs["hips"].position_m
     np.testing.assert_allclose(hips[:, :2], walk.position_m)
     assert hips[:, 2].min() > 0.8 * m.hip_height
@@ -138,18 +146,18 @@ def test_feet_stand_still_and_legs_hold_together(speed):
 
 def test_feet_end_side_by_side_after_a_walk():
     model = make_person(np.random.default_rng(1), height_m=1.75)
-    path = motion.still_then_move(motion.path_through([[0, 0, 0], [2, 0, 0]], speed_m_s=1.0), 0.5, 6.0)
-    limbs = move_person(model, motion.walk_along(path)).limbs
+    path = trajectory.wait_then_move(trajectory.path_through([[0, 0, 0], [2, 0, 0]], speed_m_s=1.0), 0.5, 6.0)
+    limbs = move_person(model, walks.walk_along(path)).limbs
     for side, sign in (("left", 1), ("right", -1)):
         np.testing.assert_allclose(
             limbs[f"{side} foot"].position_m[-1], [2, sign * model.measures.hip, model.measures.ankle], atol=0.04
         )
 
 
-def test_hand_reaches_what_it_can_and_no_farther():
+def test_hands_reach_targets_within_the_arms_length_only():
     model = make_person(np.random.default_rng(2), height_m=1.75)
     walk = straight(1.0)
-    near, far = hold(walk, (0.35, -0.2, 1.2), 1.0, 4.0), hold(walk, (1.5, 0.3, 1.4), 2.0, 3.0)
+    near, far = hand_target(walk, (0.35, -0.2, 1.2), 1.0, 4.0), hand_target(walk, (1.5, 0.3, 1.4), 2.0, 3.0)
     person = move_person(model, walk, Hands(left=far, right=near))
     asked = np.isfinite(near[:, 0])
     assert np.linalg.norm(person.right_hand.position_m - near, axis=-1)[asked].max() < 1e-3
@@ -162,7 +170,7 @@ def test_hand_reaches_what_it_can_and_no_farther():
         )
         np.testing.assert_allclose(np.linalg.norm(elbow - hand.position_m, axis=-1), model.measures.forearm, atol=1e-6)
         # Blended within 0.3 s: fast, but no jump.
-        assert motion.max_speed(hand.position_m) < 8.0
+        assert trajectory.max_speed(hand.position_m) < 8.0
     stretched = np.isfinite(far[:, 0])
     arm = np.linalg.norm(person.left_hand.position_m - person.shoulder_m["left"], axis=-1)
     assert arm[stretched].min() > 0.99 * model.arm_m
@@ -181,9 +189,9 @@ def test_arms_swing_against_the_legs():
 def test_carried_object_stays_in_the_hand(style):
     model = make_person(np.random.default_rng(4))
     walk = straight(1.0)
-    hands = Hands(right=hold(walk, (0.3, -0.2, 1.1)))
+    hands = Hands(right=hand_target(walk, (0.3, -0.2, 1.1)))
     hand, item = hand_path(model, walk, hands), make_object("bottle", np.random.default_rng(0))
-    poses = carried(hand, item.grip_m, style)
+    poses = carried_poses(hand, item.grip_m, style)
     turn = rotation_matrix(poses.quaternion)
     np.testing.assert_allclose(poses.position_m + turn @ np.array(item.grip_m), hand.position_m, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(poses.quaternion, axis=-1), 1, atol=1e-12)
@@ -195,7 +203,7 @@ def test_carried_object_stays_in_the_hand(style):
 
 def test_person_bodies_make_a_world():
     rng = np.random.default_rng(6)
-    walk = motion.random_walks(1, 6.0, rng, area_m=(1.0, -1.5, 5.0, 1.5))[0]
+    walk = walks.random_walks(1, 6.0, rng, area_m=(1.0, -1.5, 5.0, 1.5))[0]
     bodies = person_bodies(make_person(rng), walk, label=3, name="ann")
     assert len(bodies) == 15
     assert {(body.name, body.label, body.role) for body in bodies} == {("ann", 3, "person")}
@@ -211,7 +219,7 @@ def test_person_bodies_make_a_world():
 
 
 @pytest.mark.parametrize("kind", OBJECT_KINDS)
-def test_objects_have_their_tag_on_the_surface_and_their_twins(kind):
+def test_tags_lie_on_the_surface_and_equal_looks_give_equal_objects(kind):
     first = make_object(kind, np.random.default_rng(1), look=7)
     assert first == make_object(kind, np.random.default_rng(2), look=7)
     assert first != make_object(kind, np.random.default_rng(1), look=8)
@@ -246,7 +254,7 @@ def _outside(shape, point):
 
 @pytest.mark.parametrize("name", ROOMS)
 @pytest.mark.parametrize("seed", range(6))
-def test_rooms_have_room(name, seed):
+def test_rooms_are_within_their_size_and_have_free_places(name, seed):
     room = make_room(name, np.random.default_rng(seed))
     length, width, height = room.size_m
     World(room.bodies, (), 1, room.size_m).check()
@@ -272,7 +280,7 @@ def test_rooms_have_room(name, seed):
         assert 0 < point[2] < height
 
 
-def test_who_is_behind_the_screen_is_out_of_sight():
+def test_people_behind_the_partition_are_invisible():
     for seed in range(6):
         room = make_room("meeting_room", np.random.default_rng(seed))
         screen = next(body for body in room.bodies if body.name == "screen")
@@ -286,19 +294,19 @@ def test_who_is_behind_the_screen_is_out_of_sight():
                 assert abs(crossing[1] - middle[1]) < half[1]
 
 
-def test_seeds_decide_everything():
+def test_equal_seeds_give_equal_worlds():
     def draw(seed):
         rng = np.random.default_rng(seed)
         room = make_room("office", rng)
-        walks = motion.random_walks(2, 3.0, rng, area_m=room.walk_area_m, obstacles_m=room.obstacles_m)
+        people = walks.random_walks(2, 3.0, rng, area_m=room.walk_area_m, obstacles_m=room.obstacles_m)
         person = make_person(rng)
-        return room, [w.position_m for w in walks], person, person_bodies(person, walks[0])
+        return room, [w.position_m for w in people], person, person_bodies(person, people[0])
 
-    (room, walks, person, bodies), (room_2, walks_2, person_2, bodies_2) = draw(3), draw(3)
+    (room, people, person, bodies), (room_2, people_2, person_2, bodies_2) = draw(3), draw(3)
     assert [b.shapes for b in room.bodies] == [b.shapes for b in room_2.bodies]
     assert dataclasses.replace(room, bodies=()) == dataclasses.replace(room_2, bodies=())
     assert person == person_2
-    np.testing.assert_array_equal(walks, walks_2)
+    np.testing.assert_array_equal(people, people_2)
     for body, body_2 in zip(bodies, bodies_2, strict=True):
         np.testing.assert_array_equal(body.poses.quaternion, body_2.poses.quaternion)
     assert draw(4)[2] != person

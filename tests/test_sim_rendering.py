@@ -6,13 +6,15 @@ import pytest
 pytest.importorskip("mujoco")
 
 from tagjax.recording import Intrinsics
-from tagjax.sim import textures
-from tagjax.sim.flow_truth import flow_between
-from tagjax.sim.raycast import Stage, look_at
-from tagjax.sim.sensors import SENSORS, KinectV2, Xtion, frame_times, kinect_v2_intrinsics, xtion_intrinsics
-from tagjax.sim.shading import GAMMA, ILLUMINATION, Shader, auto_exposure
-from tagjax.sim.sightline import chord_m
-from tagjax.sim.world import Body, Light, Material, Poses, Shape, World
+from tagjax.sim.rendering import textures
+from tagjax.sim.rendering.exact_flow import flow_between
+from tagjax.sim.rendering.exposure import GAMMA, ILLUMINATION, auto_exposure
+from tagjax.sim.rendering.raycast import Raycaster
+from tagjax.sim.rendering.sensors import SENSORS, KinectV2, Xtion, frame_times, kinect_v2_intrinsics, xtion_intrinsics
+from tagjax.sim.rendering.shading import Shader
+from tagjax.sim.rendering.viewpoint import look_at
+from tagjax.sim.world.bodies import Body, Light, Material, Poses, Shape, World
+from tagjax.sim.world.sightline import chord_m, line_of_sight
 
 GREY = Material((0.5, 0.5, 0.5), "plain")
 CAMERA = Intrinsics(140.0, 140.0, 63.5, 47.5, 128, 96)
@@ -103,7 +105,7 @@ def test_depth_of_a_sphere_a_plane_and_a_turned_box(moves):
     direction = rays(view)
     away = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     centre, radius = np.array([2.5, 0.1, 1.0]), 0.4
-    hits = Stage(world(body("ball", "sphere", (radius, 0, 0), placed(centre)), num_steps=3)).cast(view)
+    hits = Raycaster(world(body("ball", "sphere", (radius, 0, 0), placed(centre)), num_steps=3)).cast(view)
     along = np.sum(away * (centre - view.position_m), axis=-1)
     root = radius**2 - (np.sum((centre - view.position_m) ** 2) - along**2)
     expected = (along - np.sqrt(np.maximum(root, 0))) / np.linalg.norm(direction, axis=-1)
@@ -113,12 +115,12 @@ def test_depth_of_a_sphere_a_plane_and_a_turned_box(moves):
     normal = (hits.world_m - centre) / radius
     np.testing.assert_allclose(hits.normal[inside], normal[inside], atol=1e-5)
 
-    hits = Stage(world(body("floor", "box", (9, 9, 0.5), placed((0, 0, -0.5))), num_steps=3)).cast(view)
+    hits = Raycaster(world(body("floor", "box", (9, 9, 0.5), placed((0, 0, -0.5))), num_steps=3)).cast(view)
     down = direction[..., 2] < -0.16
     np.testing.assert_allclose(hits.depth_m[down], (-view.position_m[2] / direction[..., 2])[down], atol=1e-6)
 
     quaternion, half = turned(37, (1, 2, 3)), np.array([0.3, 0.5, 0.2])
-    hits = Stage(world(body("box", "box", half, placed(centre, quaternion)), num_steps=3)).cast(view)
+    hits = Raycaster(world(body("box", "box", half, placed(centre, quaternion)), num_steps=3)).cast(view)
     face = np.abs(np.abs(hits.local_m) - half) < 1e-6
     on = hits.geom >= 0
     assert on.sum() > 500
@@ -128,23 +130,23 @@ def test_depth_of_a_sphere_a_plane_and_a_turned_box(moves):
 
 
 def test_casting_does_not_depend_on_what_was_cast_before():
-    stage, fresh = Stage(office()), Stage(office())
+    raycaster, fresh = Raycaster(office()), Raycaster(office())
     for step in (30, 0, 12):
-        stage.pose(step)
-        late = stage.cast(AHEAD)
+        raycaster.pose(step)
+        late = raycaster.cast(AHEAD)
     fresh.pose(12)
     early = fresh.cast(AHEAD)
     np.testing.assert_array_equal(late.geom, early.geom)
     np.testing.assert_array_equal(late.depth_m, early.depth_m)
-    assert set(np.unique(stage.labels(late))) == {0, 1, 2, 3}
-    whole, _, _ = stage._shoot(AHEAD.position_m, stage._background(AHEAD)[0], None)
+    assert set(np.unique(raycaster.labels(late))) == {0, 1, 2, 3}
+    whole, _, _ = raycaster._shoot(AHEAD.position_m, raycaster._background(AHEAD)[0], None)
     np.testing.assert_array_equal(whole.reshape(late.geom.shape), late.geom)
 
 
 def test_half_a_step_is_halfway():
-    stage = Stage(world(body("a", "sphere", (0.2, 0, 0), moving([[2, 0, 1], [2, 0.4, 1]])), num_steps=2))
-    stage.pose(0.5)
-    np.testing.assert_allclose(stage.cast(AHEAD).geom_position_m[0], [2, 0.2, 1])
+    raycaster = Raycaster(world(body("a", "sphere", (0.2, 0, 0), moving([[2, 0, 1], [2, 0.4, 1]])), num_steps=2))
+    raycaster.pose(0.5)
+    np.testing.assert_allclose(raycaster.cast(AHEAD).geom_position_m[0], [2, 0.2, 1])
 
 
 def test_cameras():
@@ -183,13 +185,13 @@ def test_chords_agree_with_mujoco(kind, size):
     shape = part(kind, size, position=(0.1, -0.2, 0.3), quaternion=tuple(float(q) for q in turned(50, (1, 2, -1))))
     start = rng.normal(size=(300, 3)) * 0.4 + [3, 0, 0]
     end = rng.normal(size=(300, 3)) * 0.4 - [3, 0, 0]
-    stage = Stage(world(Body("a", (shape,), Poses.fixed((0, 0, 0)))))
+    raycaster = Raycaster(world(Body("a", (shape,), Poses.fixed((0, 0, 0)))))
     length = np.linalg.norm(end - start, axis=1)
     expected = np.zeros(300)
     for number, (one, two) in enumerate(zip(start, end, strict=True)):
         ray = ((two - one) / length[number])[None]
-        geom, near, _ = stage._shoot(one, ray, None)
-        _, far, _ = stage._shoot(two, -ray, None)
+        geom, near, _ = raycaster._shoot(one, ray, None)
+        _, far, _ = raycaster._shoot(two, -ray, None)
         expected[number] = length[number] - near[0] - far[0] if geom[0] >= 0 else 0
     assert 20 < np.sum(expected > 0.01) < 300
     np.testing.assert_allclose(chord_m(shape, start, end), expected, atol=1e-6)
@@ -199,26 +201,24 @@ def test_lines_of_sight_are_blocked_dimmed_or_free():
     flesh = Material((0.7, 0.5, 0.4), transmission_db=12.0)
     metal = Material((0.7, 0.7, 0.7), reflection=-1.0, transmission_db=3.0)
     walk = moving([[2, -2, 1], [2, 0, 1]])
-    stage = Stage(
-        world(
-            body("ann", "capsule", (0.2, 0.3, 0), walk, flesh, role="person"),
-            body("ann", "sphere", (0.1, 0, 0), moving([[2.3, -2, 1], [2.3, 0, 1]]), flesh, role="person"),
-            body("bob", "sphere", (0.2, 0, 0), (3, 0, 1), flesh, role="person"),
-            body("cabinet", "box", (0.2, 0.2, 0.2), (4, 0, 1), metal),
-            num_steps=2,
-        )
+    scene = world(
+        body("ann", "capsule", (0.2, 0.3, 0), walk, flesh, role="person"),
+        body("ann", "sphere", (0.1, 0, 0), moving([[2.3, -2, 1], [2.3, 0, 1]]), flesh, role="person"),
+        body("bob", "sphere", (0.2, 0, 0), (3, 0, 1), flesh, role="person"),
+        body("cabinet", "box", (0.2, 0.2, 0.2), (4, 0, 1), metal),
+        num_steps=2,
     )
     start = np.tile([0.0, 0.0, 1.0], (5, 1))
     end = np.array([[2.7, 0, 1], [2.7, 0, 1], [3.5, 0, 1], [5, 0, 1], [3.5, 2.0, 1]])
-    sight = stage.line_of_sight(start, end, steps=np.array([0, 1, 1, 0, 1]))
+    sight = line_of_sight(scene, start, end, np.array([0, 1, 1, 0, 1]))
     np.testing.assert_array_equal(sight.loss_db, [0, 12, 24, np.inf, 0])
     np.testing.assert_array_equal(sight.crossed[2], [True, True, True, False])
     np.testing.assert_allclose(sight.inside_m[1], [0.4, 0.2, 0, 0], atol=1e-9)
-    stage.pose(1)
-    np.testing.assert_array_equal(stage.line_of_sight(start[:1], end[:1]).loss_db, [12])
-    np.testing.assert_array_equal(stage.line_of_sight(start[:1], end[:1], exclude=(0, 1)).loss_db, [0])
+    late = np.ones(1)
+    np.testing.assert_array_equal(line_of_sight(scene, start[:1], end[:1], late).loss_db, [12])
+    np.testing.assert_array_equal(line_of_sight(scene, start[:1], end[:1], late, exclude=(0, 1)).loss_db, [0])
     # Up to the surface, not into it.
-    assert stage.line_of_sight(start[:1], np.array([[1.8, 0, 1]])).loss_db[0] == 0
+    assert line_of_sight(scene, start[:1], np.array([[1.8, 0, 1]]), late).loss_db[0] == 0
 
 
 # --- light -----------------------------------------------------------------------------------------------------------
@@ -228,7 +228,7 @@ def test_lines_of_sight_are_blocked_dimmed_or_free():
 def test_shadow_is_where_geometry_says(moves):
     light, centre, radius = np.array([1.5, 0.3, 3.0]), np.array([2.2, 0.0, 1.0]), 0.3
     ball = moving([centre, centre]) if moves else Poses.fixed(centre)
-    stage = Stage(
+    raycaster = Raycaster(
         world(
             body("floor", "box", (9, 9, 0.5), (0, 0, -0.5)),
             body("ball", "sphere", (radius, 0, 0), ball),
@@ -236,24 +236,24 @@ def test_shadow_is_where_geometry_says(moves):
             lights=(Light(tuple(float(x) for x in light)),),
         )
     )
-    hits = stage.cast(look_at(CAMERA, [0.0, 0.0, 2.0], [2.5, 0.0, 0.2]))
-    lit = stage.lit(hits, light)
-    floor = hits.geom == np.flatnonzero([shape.kind == "box" for shape in stage.geom_shape])[0]
+    hits = raycaster.cast(look_at(CAMERA, [0.0, 0.0, 2.0], [2.5, 0.0, 0.2]))
+    lit = raycaster.lit(hits, light)
+    floor = hits.geom == np.flatnonzero([shape.kind == "box" for shape in raycaster.geom_shape])[0]
     ray = hits.world_m - light
     away = np.linalg.norm(ray, axis=-1)
     along = np.clip(np.sum(ray * (centre - light), axis=-1) / away**2, 0, 1)
     gap = np.linalg.norm(light + along[..., None] * ray - centre, axis=-1)
     assert np.sum(floor & (gap < radius)) > 200
     np.testing.assert_array_equal(lit[floor], (gap >= radius)[floor])
-    shader = Shader(stage)
+    shader = Shader(raycaster)
     bright, flat = shader.radiance(hits), shader.radiance(hits, shadows=False)
     assert np.all(bright[floor & ~lit] < 0.8 * flat[floor & ~lit])
     np.testing.assert_array_equal(bright[floor & lit], flat[floor & lit])
 
 
-def test_what_moves_under_a_table_does_not_shade_its_top():
+def test_bodies_that_move_under_a_table_do_not_shade_its_top():
     """Nor the floor on which it stands: both touch."""
-    stage = Stage(
+    raycaster = Raycaster(
         world(
             body("floor", "box", (9, 9, 0.5), (0, 0, -0.5)),
             body("top", "box", (0.5, 0.5, 0.02), (2.5, 0, 0.5)),
@@ -262,38 +262,38 @@ def test_what_moves_under_a_table_does_not_shade_its_top():
             lights=(Light((2.4, 0.1, 3.0)),),
         )
     )
-    hits = stage.cast(look_at(CAMERA, [0.0, 0.0, 2.0], [2.5, 0.0, 0.4]))
+    hits = raycaster.cast(look_at(CAMERA, [0.0, 0.0, 2.0], [2.5, 0.0, 0.4]))
     top = np.abs(hits.world_m[..., 2] - 0.52) < 1e-6
     assert top.sum() > 500
-    assert stage.lit(hits, stage.world.lights[0].position_m)[top].all()
+    assert raycaster.lit(hits, raycaster.world.lights[0].position_m)[top].all()
 
 
-def test_light_falls_with_the_cosine_and_the_square_of_distance():
+def test_light_decreases_with_the_cosine_and_the_square_of_distance():
     """Lambert on a white floor under a lamp, and full light at 2 m from a lamp of power 1."""
     white = Material((0.9, 0.9, 0.9), "plain")
     floor = body("floor", "box", (9, 9, 0.5), (0, 0, -0.5), white)
-    stage = Stage(world(floor, lights=(Light((1.0, 0.0, 2.0)),), ambient=0.0))
-    hits = stage.cast(look_at(CAMERA, [1.0, 0.0, 1.9], [1.0, 0.0, 0.0]))
-    radiance = Shader(stage).radiance(hits)
+    raycaster = Raycaster(world(floor, lights=(Light((1.0, 0.0, 2.0)),), ambient=0.0))
+    hits = raycaster.cast(look_at(CAMERA, [1.0, 0.0, 1.9], [1.0, 0.0, 0.0]))
+    radiance = Shader(raycaster).radiance(hits)
     away = np.linalg.norm(hits.world_m - [1, 0, 2], axis=-1)
     np.testing.assert_allclose(radiance[..., 1], 0.9 * (4.09 / (away**2 + 0.09)) * 2 / away, rtol=1e-4)
     assert abs(radiance.max() - 0.9) < 1e-3
 
 
-def test_shine_glares_where_the_lamp_is_mirrored():
+def test_highlights_lie_where_the_lamp_is_reflected():
     glossy = Material((0.1, 0.1, 0.1), "plain", shine=0.8)
-    stage = Stage(world(wall(3.0, glossy), lights=(Light((0.0, 0.6, 1.0)),), ambient=0.1))
-    hits = stage.cast(AHEAD)
-    radiance = Shader(stage).radiance(hits)[..., 0]
+    raycaster = Raycaster(world(wall(3.0, glossy), lights=(Light((0.0, 0.6, 1.0)),), ambient=0.1))
+    hits = raycaster.cast(AHEAD)
+    radiance = Shader(raycaster).radiance(hits)[..., 0]
     row, column = np.unravel_index(np.argmax(radiance), radiance.shape)
     np.testing.assert_allclose(hits.world_m[row, column], [3, 0.3, 1], atol=0.06)
     assert radiance.max() > 3 * np.median(radiance)
 
 
 def test_three_levels_of_light():
-    stage = Stage(office())
-    hits = stage.cast(AHEAD)
-    radiance = Shader(stage).radiance(hits)
+    raycaster = Raycaster(office())
+    hits = raycaster.cast(AHEAD)
+    radiance = Shader(raycaster).radiance(hits)
     rng = np.random.default_rng(0)
     exposure = auto_exposure(radiance)
     assert abs(np.quantile(radiance * exposure, 0.95) - 0.8) < 0.05
@@ -309,7 +309,7 @@ def test_three_levels_of_light():
 
 
 @pytest.mark.parametrize("name", ["bright", "dim", "dark"])
-def test_colour_noise_follows_its_law(name):
+def test_colour_noise_follows_its_model(name):
     level = ILLUMINATION[name]
     flat = np.full((200, 200, 3), 0.45, np.float32)
     picture = level.expose(flat, np.random.default_rng(1))
@@ -318,13 +318,15 @@ def test_colour_noise_follows_its_law(name):
     np.testing.assert_allclose(linear.std(), level.noise(np.full(1, 0.45))[0], rtol=0.06)
 
 
-def test_blur_smears_what_moves_by_its_speed():
-    """An edge that moves 1.2 m/s x 0.05 s at 2 m leaves a ramp of 4 px; what rests stays sharp."""
+def test_motion_blur_is_proportional_to_speed():
+    """An edge that moves 1.2 m/s x 0.05 s at 2 m leaves a ramp of 4 px; static surfaces stay sharp."""
     speed = np.stack([np.full(41, 1.9), np.linspace(-0.6, -0.12, 41), np.full(41, 1.0)], -1)
     white = Material((0.9, 0.9, 0.9), "plain")
     board = body("board", "box", (0.01, 0.3, 0.3), moving(speed), white)
-    stage = Stage(world(board, wall(6.0, Material((0.0, 0.0, 0.0), "plain")), num_steps=41, ambient=1.0, lights=()))
-    shader = Shader(stage)
+    raycaster = Raycaster(
+        world(board, wall(6.0, Material((0.0, 0.0, 0.0), "plain")), num_steps=41, ambient=1.0, lights=())
+    )
+    shader = Shader(raycaster)
     sharp = shader.blurred(AHEAD, 20, 0.0, num_casts=3)[48, :, 1]
     soft = shader.blurred(AHEAD, 20, 5.0, num_casts=16)[48, :, 1]
     partial = [np.sum((row > 0.02 * row.max()) & (row < 0.98 * row.max())) for row in (sharp, soft)]
@@ -332,7 +334,7 @@ def test_blur_smears_what_moves_by_its_speed():
     expected = 140 * 0.06 / 1.89
     assert abs(partial[1] / 2 - expected) <= 1
     np.testing.assert_allclose(soft.sum(), sharp.sum(), rtol=0.02)
-    assert stage.step == 20
+    assert raycaster.step == 20
 
 
 # --- textures --------------------------------------------------------------------------------------------------------
@@ -349,12 +351,12 @@ def test_textures_move_with_their_body(texture):
     poses = moving(
         [[2, 0, 1], [2, -shift, 1], [2, 0, 1]], [turned(0), turned(0), turned(180, (1, 0, 0))]
     )  # +x away, so -y is right
-    stage = Stage(world(body("board", "box", (0.01, 0.45, 0.35), poses, material), num_steps=3))
-    shader = Shader(stage)
+    raycaster = Raycaster(world(body("board", "box", (0.01, 0.45, 0.35), poses, material), num_steps=3))
+    shader = Shader(raycaster)
     looks = []
     for step in range(3):
-        stage.pose(step)
-        looks.append(shader.surface(stage.cast(AHEAD)).albedo[30:66, 40:80])
+        raycaster.pose(step)
+        looks.append(shader.surface(raycaster.cast(AHEAD)).albedo[30:66, 40:80])
     assert looks[0].std() > 0.05
     np.testing.assert_allclose(looks[1][:, 7:], looks[0][:, :-7], atol=0.02)
     assert np.mean(np.abs(looks[1] - looks[0])) > 0.02
@@ -364,23 +366,23 @@ def test_textures_move_with_their_body(texture):
 def test_each_face_of_a_turned_box_has_its_own_picture():
     """A pattern laid on by the wrong axis would be stretched into lines."""
     checker = Material((0.5, 0.5, 0.5), "checker", scale=9.0, contrast=0.8)
-    stage = Stage(
+    raycaster = Raycaster(
         world(
             body("a", "box", (0.4, 0.4, 0.4), moving([[2, 0, 1]] * 2, [turned(90), turned(90, (0, 1, 0))]), checker),
             num_steps=2,
         )
     )
     for step in range(2):
-        stage.pose(step)
-        albedo = Shader(stage).surface(stage.cast(AHEAD)).albedo[30:66, 46:82, 0]
+        raycaster.pose(step)
+        albedo = Shader(raycaster).surface(raycaster.cast(AHEAD)).albedo[30:66, 46:82, 0]
         assert np.median(np.std(albedo, axis=1)) > 0.2
         assert np.median(np.std(albedo, axis=0)) > 0.2
 
 
 def test_seeds_and_contrast_change_a_texture():
     def look(**kwargs):
-        stage = Stage(world(wall(3.0, Material((0.5, 0.5, 0.5), **kwargs))))
-        return Shader(stage).surface(stage.cast(AHEAD)).albedo
+        raycaster = Raycaster(world(wall(3.0, Material((0.5, 0.5, 0.5), **kwargs))))
+        return Shader(raycaster).surface(raycaster.cast(AHEAD)).albedo
 
     np.testing.assert_array_equal(look(seed=1), look(seed=1))
     assert np.mean(np.abs(look(seed=1) - look(seed=2))) > 0.02
@@ -389,13 +391,13 @@ def test_seeds_and_contrast_change_a_texture():
     assert look(texture="checker", scale=400.0, contrast=0.8).std() < 1e-3
 
 
-def test_photographs_that_are_missing_are_told(monkeypatch):
+def test_missing_photographs_give_a_warning(monkeypatch):
     monkeypatch.setitem(textures.PHOTOGRAPHS, "absent", ("no_such_package", "a.jpg"))
     material = Material((0.5, 0.5, 0.5), "photo", photo="absent", contrast=0.5)
-    stage = Stage(world(wall(3.0, material)))
+    raycaster = Raycaster(world(wall(3.0, material)))
     with pytest.warns(UserWarning, match="no_such_package"):
-        shader = Shader(stage)
-    assert shader.surface(stage.cast(AHEAD)).albedo.std() > 0.02
+        shader = Shader(raycaster)
+    assert shader.surface(raycaster.cast(AHEAD)).albedo.std() > 0.02
     with pytest.raises(ValueError, match="hopper"):
         textures.photograph("nobody")
 
@@ -404,7 +406,7 @@ def test_photographs_that_are_missing_are_told(monkeypatch):
 
 
 def flat_depth(sensor, distance_m, reflectance=0.5, shine=0.0, seed=0):
-    hits = Stage(world(wall(distance_m))).cast(AHEAD)
+    hits = Raycaster(world(wall(distance_m))).cast(AHEAD)
     shape = hits.depth_m.shape
     depth = sensor.measure(
         hits, np.full(shape, reflectance, np.float32), np.full(shape, shine, np.float32), np.random.default_rng(seed)
@@ -414,7 +416,7 @@ def flat_depth(sensor, distance_m, reflectance=0.5, shine=0.0, seed=0):
 
 @pytest.mark.parametrize("distance_m", [1.0, 2.5, 3.5])
 @pytest.mark.parametrize("name", ["kinect_v2", "xtion"])
-def test_depth_noise_follows_its_law(name, distance_m):
+def test_depth_noise_follows_its_model(name, distance_m):
     sensor = SENSORS[name]
     depth = flat_depth(sensor, distance_m)
     found = depth[depth > 0]
@@ -426,7 +428,7 @@ def test_depth_noise_follows_its_law(name, distance_m):
     assert abs(np.median(found) - distance_m) < 0.5 * law + 0.5 * distance_m**2 / 348 + 0.001
 
 
-def test_noise_laws_have_their_published_values():
+def test_noise_models_have_their_published_values():
     """Fankhauser et al. at 4 m, and at 2 m and 60 degrees; Nguyen et al. at 3 m."""
     half = np.full(1, 0.5)
     np.testing.assert_allclose(KinectV2().noise_m(np.full(1, 4.0), np.ones(1), half), 4.3e-3, rtol=1e-3)
@@ -437,8 +439,8 @@ def test_noise_laws_have_their_published_values():
 
 @pytest.mark.parametrize("name", ["kinect_v2", "xtion"])
 def test_a_slope_is_no_edge(name):
-    stage = Stage(world(body("floor", "box", (20, 20, 0.5), (0, 0, -0.5))))
-    hits = stage.cast(look_at(CAMERA, [0.0, 0.0, 0.8], [3.0, 0.0, 0.0]))
+    raycaster = Raycaster(world(body("floor", "box", (20, 20, 0.5), (0, 0, -0.5))))
+    hits = raycaster.cast(look_at(CAMERA, [0.0, 0.0, 0.8], [3.0, 0.0, 0.0]))
     shape, sensor = hits.depth_m.shape, SENSORS[name]
     bright = np.full(shape, 0.5, np.float32)
     depth = sensor.measure(hits, bright, np.zeros(shape, np.float32), np.random.default_rng(0)) / 1000.0
@@ -459,7 +461,7 @@ def test_xtion_quantises_disparity_and_kinect_does_not():
     assert len(np.unique(fine)) > len(levels)
 
 
-def test_dark_far_shiny_and_near_surfaces_are_lost():
+def test_dark_far_shiny_and_near_surfaces_have_no_depth():
     for sensor in (KinectV2(), Xtion()):
         missing = {
             case: np.mean(flat_depth(sensor, *case) == 0)
@@ -476,12 +478,12 @@ def test_dark_far_shiny_and_near_surfaces_are_lost():
 
 
 @pytest.mark.parametrize("name", ["kinect_v2", "xtion"])
-def test_grazing_surfaces_are_lost(name):
+def test_grazing_surfaces_have_no_depth(name):
     """A floor from 1 m up, and from 0.15 m up: hardly any return at the same distance."""
     shares = []
     for height in (1.5, 0.12):
-        stage = Stage(world(body("floor", "box", (20, 20, 0.5), (0, 0, -0.5))))
-        hits = stage.cast(look_at(CAMERA, [0.0, 0.0, height], [3.0, 0.0, 0.0]))
+        raycaster = Raycaster(world(body("floor", "box", (20, 20, 0.5), (0, 0, -0.5))))
+        hits = raycaster.cast(look_at(CAMERA, [0.0, 0.0, height], [3.0, 0.0, 0.0]))
         shape = hits.depth_m.shape
         depth = SENSORS[name].measure(
             hits, np.full(shape, 0.5, np.float32), np.zeros(shape, np.float32), np.random.default_rng(0)
@@ -493,8 +495,8 @@ def test_grazing_surfaces_are_lost(name):
 
 
 def scene_with_an_edge(sensor, seed=0):
-    stage = Stage(world(wall(3.0), body("board", "box", (0.01, 0.3, 2), (1.51, 0, 1))))
-    hits = stage.cast(look_at(xtion_intrinsics(320), [0.0, 0.0, 1.0], [1.0, 0.0, 1.0]))
+    raycaster = Raycaster(world(wall(3.0), body("board", "box", (0.01, 0.3, 2), (1.51, 0, 1))))
+    hits = raycaster.cast(look_at(xtion_intrinsics(320), [0.0, 0.0, 1.0], [1.0, 0.0, 1.0]))
     shape = hits.depth_m.shape
     depth = sensor.measure(
         hits, np.full(shape, 0.5, np.float32), np.zeros(shape, np.float32), np.random.default_rng(seed)
@@ -522,13 +524,13 @@ def test_kinect_has_flying_pixels_at_edges_only():
 
 def test_frame_times():
     rng = np.random.default_rng(0)
-    times = frame_times(4000, 30.0, rng, jitter_s=0.004, drop_share=0.1)
+    times = frame_times(4000, 30.0, rng, jitter_s=0.004, drop_probability=0.1)
     assert times[0] == 0
     assert np.all(np.diff(times) > 0)
     np.testing.assert_allclose(np.mean(np.diff(times)), 1 / 30 / 0.9, rtol=0.02)
     even = frame_times(4000, 30.0, rng, jitter_s=0.002)
     np.testing.assert_allclose(np.std(even - np.arange(4000) / 30), 0.002, rtol=0.05)
-    for bad in ({"num_frames": 0}, {"rate_hz": 0.0}, {"drop_share": 1.0}, {"jitter_s": -1.0}):
+    for bad in ({"num_frames": 0}, {"rate_hz": 0.0}, {"drop_probability": 1.0}, {"jitter_s": -1.0}):
         with pytest.raises(ValueError, match=r"needed|expected"):
             frame_times(**{"num_frames": 5, "rate_hz": 30.0, "rng": rng} | bad)
 
@@ -541,16 +543,16 @@ def test_flow_of_a_body_that_moves_and_turns():
     turn, shift = turned(20, (1, -1, 2)), np.array([0.1, 0.15, -0.08])
     for kind, size in (("sphere", (0.4, 0, 0)), ("box", (0.3, 0.3, 0.3))):
         centre = np.array([2.0, 0.0, 1.0])
-        stage = Stage(
+        raycaster = Raycaster(
             world(
                 body("a", kind, size, moving([centre, centre + shift], [turned(0), turn])),
                 wall(4.0),
                 num_steps=2,
             )
         )
-        before = stage.cast(AHEAD)
-        stage.pose(1)
-        truth = flow_between(before, stage.cast(AHEAD))
+        before = raycaster.cast(AHEAD)
+        raycaster.pose(1)
+        truth = flow_between(before, raycaster.cast(AHEAD))
         on = before.depth_m < 3
         points = AHEAD.position_m + rays(AHEAD) * before.depth_m[..., None] - centre
         w, axis = turn[0], turn[1:]
@@ -563,10 +565,10 @@ def test_flow_of_a_body_that_moves_and_turns():
 
 
 def test_flow_of_a_moved_camera():
-    stage = Stage(office())
-    before = stage.cast(AHEAD)
+    raycaster = Raycaster(office())
+    before = raycaster.cast(AHEAD)
     other = look_at(CAMERA, [0.1, 0.05, 1.05], [1.1, 0.0, 1.0])
-    truth = flow_between(before, stage.cast(other))
+    truth = flow_between(before, raycaster.cast(other))
     column, row = np.meshgrid(np.arange(128), np.arange(96))
     hit = before.geom >= 0
     expected = project(other, before.world_m[hit]) - np.stack([column, row], -1)[hit]
@@ -576,12 +578,12 @@ def test_flow_of_a_moved_camera():
 
 @pytest.fixture(scope="module")
 def pair():
-    stage = Stage(office())
-    stage.pose(10)
-    before = stage.cast(AHEAD)
-    stage.pose(15)
-    after = stage.cast(AHEAD)
-    return stage, before, after, flow_between(before, after)
+    raycaster = Raycaster(office())
+    raycaster.pose(10)
+    before = raycaster.cast(AHEAD)
+    raycaster.pose(15)
+    after = raycaster.cast(AHEAD)
+    return raycaster, before, after, flow_between(before, after)
 
 
 def interior(hits, target, flow):
@@ -615,9 +617,9 @@ def test_forward_and_backward_flow_agree_where_visible(pair):
     assert np.median(error[moved]) < 0.01
 
 
-def test_warping_by_the_flow_gives_the_first_picture_back(pair):
-    stage, before, after, truth = pair
-    shader = Shader(stage)
+def test_warping_by_the_flow_reconstructs_the_first_picture(pair):
+    raycaster, before, after, truth = pair
+    shader = Shader(raycaster)
     one, two = shader.surface(before).albedo, shader.surface(after).albedo
     fits, *place = interior(before, after, truth.forward_px)
     moving_pixels = fits & ~truth.forward_occluded & before.moving
@@ -630,18 +632,18 @@ def test_warping_by_the_flow_gives_the_first_picture_back(pair):
 
 @pytest.mark.parametrize("forward", [True, False])
 def test_occlusion_agrees_with_rays_to_the_moved_points(pair, forward):
-    stage, before, after, truth = pair
+    raycaster, before, after, truth = pair
     if not forward:
-        stage.pose(10)
+        raycaster.pose(10)
         before, after = after, before
     else:
-        stage.pose(15)
+        raycaster.pose(15)
     occluded = truth.forward_occluded if forward else truth.backward_occluded
     turn = after.geom_rotation[before.geom]
     world_m = np.einsum("hwij,hwj->hwi", turn, before.local_m) + after.geom_position_m[before.geom]
     ray = (world_m - AHEAD.position_m).reshape(-1, 3)
     away = np.linalg.norm(ray, axis=1)
-    _, distance, _ = stage._shoot(AHEAD.position_m, ray / away[:, None], None)
+    _, distance, _ = raycaster._shoot(AHEAD.position_m, ray / away[:, None], None)
     hidden = (distance < away - 1e-4).reshape(occluded.shape)
     assert hidden.sum() > 100
     # Only pixels on a rim may differ.
@@ -649,14 +651,14 @@ def test_occlusion_agrees_with_rays_to_the_moved_points(pair, forward):
     assert np.sum(hidden & occluded) > 0.85 * hidden.sum()
 
 
-def test_what_turns_away_is_occluded():
-    """A ball that spins in place: what goes round the side is hidden, though the ball still covers the pixel."""
-    stage = Stage(
+def test_surfaces_that_turn_away_are_occluded():
+    """A ball that spins in place: points that move to the far side are hidden, though the ball still covers the pixel."""
+    raycaster = Raycaster(
         world(body("ball", "sphere", (0.5, 0, 0), moving([[2, 0, 1]] * 2, [turned(0), turned(50)])), num_steps=2)
     )
-    before = stage.cast(AHEAD)
-    stage.pose(1)
-    truth = flow_between(before, stage.cast(AHEAD))
+    before = raycaster.cast(AHEAD)
+    raycaster.pose(1)
+    truth = flow_between(before, raycaster.cast(AHEAD))
     on = before.geom >= 0
     place = np.array([2.0, 0.0, 1.0])
     c, s = np.cos(np.radians(50)), np.sin(np.radians(50))
@@ -666,20 +668,20 @@ def test_what_turns_away_is_occluded():
     assert np.mean(truth.forward_occluded[on] == away[on]) > 0.98
 
 
-def test_flow_needs_casts_of_one_stage(pair):
+def test_flow_needs_casts_of_one_world(pair):
     _, before, _, _ = pair
-    other = Stage(world(wall(3.0))).cast(AHEAD)
-    with pytest.raises(ValueError, match="one stage"):
+    other = Raycaster(world(wall(3.0))).cast(AHEAD)
+    with pytest.raises(ValueError, match="one world"):
         flow_between(before, other)
 
 
 def test_same_seed_same_pictures():
     def frame(seed):
         rng = np.random.default_rng(seed)
-        stage = Stage(office())
-        stage.pose(7)
-        hits = stage.cast(AHEAD)
-        shader = Shader(stage)
+        raycaster = Raycaster(office())
+        raycaster.pose(7)
+        hits = raycaster.cast(AHEAD)
+        shader = Shader(raycaster)
         surface = shader.surface(hits)
         colour = ILLUMINATION["dim"].expose(shader.radiance(hits, surface), rng)
         return colour, *(sensor.measure(hits, surface.reflectance, surface.shine, rng) for sensor in SENSORS.values())

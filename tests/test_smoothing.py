@@ -23,7 +23,7 @@ from tagjax.tagattention import TagAttention
 from tagjax.tagattention.paper import TagAttentionPaper
 from tagjax.tracing.clips import Clip, ClipSettings, load_clip
 from tagjax.tracing.recordings import trace_recording
-from tagjax.tracing.tracer import Camera, Frame, Later, Trace, trace
+from tagjax.tracing.tracer import BackwardMessage, Camera, Frame, Trace, trace
 from tagjax.training.run import evaluate_tracers
 
 EPCS = list(synthetic.EPCS)
@@ -40,10 +40,10 @@ def _tracer(**changed) -> TagAttention:
 
 
 @eqx.filter_jit
-def _back(tracer: TagAttention, camera: Camera, frames: Frame) -> Later:
+def _back(tracer: TagAttention, camera: Camera, frames: Frame) -> BackwardMessage:
     """What later frames say of each, in the order of time; `frames` go backwards."""
     first = jax.tree.map(lambda leaf: leaf[0], frames)
-    step = lambda state, frame: tracer.look_back(camera, state, frame)  # noqa: E731
+    step = lambda state, frame: tracer.backward_step(camera, state, frame)  # noqa: E731
     _, told = jax.lax.scan(step, tracer.init(camera, first), frames)
     return jax.tree.map(lambda leaf: leaf[::-1], told)
 
@@ -174,11 +174,11 @@ def test_the_first_frame_shows_what_the_later_ones_tell(recording: Recording) ->
         assert [number for number, _ in smoothed] == list(range(first, last))
         for tag, box in enumerate(synthetic.BOXES.values()):
             assert _outlines(smoothed[0][1].mask[tag], box) > 0.6
-            assert smoothed[0][1].found[tag]
+            assert smoothed[0][1].detected[tag]
             assert np.mean([_outlines(out.mask[tag], box) for _, out in smoothed]) > 0.6
     for tag, box in enumerate(synthetic.BOXES.values()):
         assert _outlines(filtered.mask[tag], box) < 0.3
-        assert not filtered.found[tag]
+        assert not filtered.detected[tag]
 
 
 @pytest.mark.slow
@@ -188,7 +188,7 @@ def test_pieces_and_groups_give_what_two_scans_give(recording: Recording) -> Non
     pieces = list(trace_recording(tracer, recording, _load, epcs=EPCS, settings=settings))
     clip, turned = (_load(one, 0, NUM_FRAMES, epcs=EPCS) for one in (recording, played_backwards(recording)))
     later = _back(tracer, turned.camera, turned.frames)
-    whole = eqx.filter_jit(trace)(tracer, clip.camera, dataclasses.replace(clip.frames, later=later))
+    whole = eqx.filter_jit(trace)(tracer, clip.camera, dataclasses.replace(clip.frames, backward_message=later))
     for number, out in pieces:
         np.testing.assert_allclose(out.mask, whole.mask[number], atol=0.02)  # half precision in between
         np.testing.assert_allclose(out.confidence, whole.confidence[number], atol=0.01)
@@ -203,7 +203,7 @@ def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
     @eqx.filter_grad
     def gradient(tracer):
         later = _back(tracer, turned.camera, turned.frames)
-        return jnp.mean(trace(tracer, clip.camera, dataclasses.replace(clip.frames, later=later)).mask)
+        return jnp.mean(trace(tracer, clip.camera, dataclasses.replace(clip.frames, backward_message=later)).mask)
 
     leaves = [leaf for leaf in jax.tree.leaves(gradient(_tracer())) if leaf is not None]
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)

@@ -1,4 +1,4 @@
-"""Stories and their films: who holds what when, what hides what, and reads that fit the truth."""
+"""Stories and their recordings: objects in hands, occlusion, and reads that agree with the truth."""
 
 from __future__ import annotations
 
@@ -10,99 +10,100 @@ import pytest
 
 from tagjax.radio.coherence import coherence, phase_residual
 from tagjax.recording import Recording
-from tagjax.sim.objects import bounds
-from tagjax.sim.raycast import Stage, look_at
-from tagjax.sim.record import CaptureSettings, film
-from tagjax.sim.sensors import kinect_v2_intrinsics
-from tagjax.sim.sightline import chord_m, is_free, line_of_sight
-from tagjax.sim.stories import STORIES, tell
-from tagjax.sim.visibility import seen_share, steps_every, stretches, surface_points
-from tagjax.sim.world import STEP_S, Material, Shape, rotation_matrix, tag_path
+from tagjax.sim.record import CaptureSettings, simulate_recording
+from tagjax.sim.rendering.raycast import Raycaster
+from tagjax.sim.rendering.sensors import kinect_v2_intrinsics
+from tagjax.sim.rendering.viewpoint import look_at
+from tagjax.sim.rendering.visibility import intervals, sampled_steps, surface_points, visible_fraction
+from tagjax.sim.stories import STORIES, build_scenario
+from tagjax.sim.world.bodies import STEP_S, Material, Shape, rotation_matrix, tag_path
+from tagjax.sim.world.objects import bounds
+from tagjax.sim.world.sightline import chord_m, is_free, line_of_sight
 
 PLAIN = Material((0.5, 0.5, 0.5))
 
 LONG_S = {"enter_leave": 12.0, "shop_handover": 19.0}
-"""What cannot be told in the 3 s of the others."""
+"""Durations of the stories that need more than 3 s."""
 
 SMALL = CaptureSettings(width=64, frame_rate_hz=5.0, jitter_s=0.0)
 
 
-def _tell(name: str, duration_s: float = 3.0, seed: int = 1, **settings):
-    return tell(name, np.random.default_rng(seed), duration_s, settings)
+def _build(name: str, duration_s: float = 3.0, seed: int = 1, **settings):
+    return build_scenario(name, np.random.default_rng(seed), duration_s, settings)
 
 
-def _object(filmed, number: int):
-    return filmed.world.bodies[filmed.world.tags[number].body]
-
-
-@pytest.fixture(scope="module")
-def told():
-    return _tell("handheld", kinds=("box", "toy"), still_s=0.3)
+def _object(scenario, number: int):
+    return scenario.world.bodies[scenario.world.tags[number].body]
 
 
 @pytest.fixture(scope="module")
-def two(told) -> Recording:
-    return film(told, dataclasses.replace(SMALL, flow=True), seed=7, name="two")
+def waved():
+    return _build("handheld", kinds=("box", "toy"), stationary_s=0.3)
+
+
+@pytest.fixture(scope="module")
+def two(waved) -> Recording:
+    return simulate_recording(waved, dataclasses.replace(SMALL, flow=True), seed=7, name="two")
 
 
 @pytest.mark.parametrize("name", STORIES)
-def test_every_story_is_a_world_that_can_be(name):
-    filmed = _tell(name, LONG_S.get(name, 3.0))
-    filmed.world.check()
-    epcs = [tag.epc for tag in filmed.world.tags]
+def test_every_story_gives_a_possible_world(name):
+    scenario = _build(name, LONG_S.get(name, 3.0))
+    scenario.world.check()
+    epcs = [tag.epc for tag in scenario.world.tags]
     assert epcs
     assert len(set(epcs)) == len(epcs)
-    named = {(body.name, body.label) for body in filmed.world.bodies if body.label}  # a person has many limbs
-    assert sorted(label for _, label in named) == list(range(1, len(filmed.world.names) + 1))
-    again = _tell(name, LONG_S.get(name, 3.0))
-    for one, other in zip(filmed.world.bodies, again.world.bodies, strict=True):
+    named = {(body.name, body.label) for body in scenario.world.bodies if body.label}  # a person has many limbs
+    assert sorted(label for _, label in named) == list(range(1, len(scenario.world.names) + 1))
+    again = _build(name, LONG_S.get(name, 3.0))
+    for one, other in zip(scenario.world.bodies, again.world.bodies, strict=True):
         np.testing.assert_array_equal(one.poses.position_m, other.poses.position_m)
 
 
 def test_unknown_stories_and_settings_are_refused():
     with pytest.raises(ValueError, match="Unknown story 'juggle'; known are handheld"):
-        _tell("juggle")
+        _build("juggle")
     with pytest.raises(ValueError, match="unknown setting colour; known are room, kinds"):
-        _tell("handheld", colour=3)
+        _build("handheld", colour=3)
     with pytest.raises(ValueError, match="positive duration"):
-        _tell("handheld", 0.0)
+        _build("handheld", 0.0)
     with pytest.raises(ValueError, match="before one object"):
-        _tell("handheld", passing=True, kinds=("box", "toy"))
+        _build("handheld", notebook_occluder=True, kinds=("box", "toy"))
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 2.5])
-def test_the_object_is_still_then_moves_as_fast_as_asked(speed_m_s):
-    filmed = _tell("handheld", 6.0, kinds=("bottle",), still_s=2.0, speed_m_s=speed_m_s)
-    path = _object(filmed, 0).poses.position_m
+def test_the_object_is_stationary_then_moves_at_the_given_speed(speed_m_s):
+    scenario = _build("handheld", 6.0, kinds=("bottle",), stationary_s=2.0, speed_m_s=speed_m_s)
+    path = _object(scenario, 0).poses.position_m
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / STEP_S
     assert speed[: int(1.7 / STEP_S)].max() < 0.02
     # An arm that cannot reach as far as its wave goes is clamped, and then slower.
     assert 0.7 * speed_m_s < speed.max() < 1.25 * speed_m_s
 
 
-def test_look_alikes_look_alike_and_others_do_not():
-    filmed = _tell("handheld", kinds=("bottle", "toy", "box", "bottle"), lookalikes=("bottle",))
-    one, other = _object(filmed, 0), _object(filmed, 3)
+def test_lookalikes_are_identical_and_others_differ():
+    scenario = _build("handheld", kinds=("bottle", "toy", "box", "bottle"), lookalikes=("bottle",))
+    one, other = _object(scenario, 0), _object(scenario, 3)
     assert one.name == other.name == "bottle"
     assert one.shapes == other.shapes
-    plain = _tell("handheld", kinds=("bottle", "bottle"))
+    plain = _build("handheld", kinds=("bottle", "bottle"))
     assert _object(plain, 0).shapes != _object(plain, 1).shapes
 
 
-def test_objects_in_one_grip_are_one_rigid_thing():
-    filmed = _tell("handheld", kinds=("bottle", "box"), one_grip=True)
-    one, other = _object(filmed, 0).poses, _object(filmed, 1).poses
+def test_objects_in_one_grip_are_one_rigid_body():
+    scenario = _build("handheld", kinds=("bottle", "box"), one_grip=True)
+    one, other = _object(scenario, 0).poses, _object(scenario, 1).poses
     apart = np.einsum("tji,tj->ti", rotation_matrix(one.quaternion), other.position_m - one.position_m)
     np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-9)
     assert 0.03 < np.linalg.norm(apart[0]) < 0.4
 
 
 def test_a_handed_over_object_goes_from_one_to_the_other_without_a_jump():
-    filmed = _tell("handover", 6.0)
-    path = _object(filmed, 0).poses.position_m
+    scenario = _build("handover", 6.0)
+    path = _object(scenario, 0).poses.position_m
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() / STEP_S < 4.0
     people = {}
-    for body in filmed.world.bodies:
+    for body in scenario.world.bodies:
         if body.role == "person":
             people.setdefault(body.name, []).append(body.poses.position_m)
     away = [np.linalg.norm(np.mean(parts, axis=0)[:, :2] - path[:, :2], axis=1) for parts in people.values()]
@@ -110,30 +111,30 @@ def test_a_handed_over_object_goes_from_one_to_the_other_without_a_jump():
     assert away[1][-1] < away[0][-1]
 
 
-def test_what_is_put_down_stays_and_the_hand_goes():
-    filmed = _tell("put_down", 6.0)
-    path = _object(filmed, 0).poses.position_m
+def test_an_object_put_down_stays_and_the_hand_leaves():
+    scenario = _build("put_down", 6.0)
+    path = _object(scenario, 0).poses.position_m
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / STEP_S
     assert speed[:340].max() > 0.5
     assert speed.max() < 4.0
     np.testing.assert_array_equal(path[-1], path[380])
-    stand = next(body for body in filmed.world.bodies if body.name == "stand")
+    stand = next(body for body in scenario.world.bodies if body.name == "stand")
     # It stands on the stand: bottom on top.
-    bottom = path[-1, 2] - _half_height(filmed)
+    bottom = path[-1, 2] - _half_height(scenario)
     assert bottom == pytest.approx(2 * stand.shapes[0].size_m[2], abs=1e-6)
-    hands = [body.poses.position_m for body in filmed.world.bodies if body.role == "person"]
+    hands = [body.poses.position_m for body in scenario.world.bodies if body.role == "person"]
     nearest = np.min([np.linalg.norm(hand - path, axis=1) for hand in hands], axis=0)
     assert nearest[-1] > nearest[330] + 0.1
 
 
-def _half_height(filmed) -> float:
-    low, high = bounds(_object(filmed, 0).shapes)
+def _half_height(scenario) -> float:
+    low, high = bounds(_object(scenario, 0).shapes)
     return float(high[2] - low[2]) / 2
 
 
-def test_the_notebook_hides_the_object_and_lets_it_be_seen_again():
-    filmed = _tell("handheld", 6.0, kinds=("bottle",), passing=True)
-    seen = film(filmed, dataclasses.replace(SMALL, width=128), seed=1, name="passing")
+def test_the_notebook_occludes_the_object_for_a_while():
+    scenario = _build("handheld", 6.0, kinds=("bottle",), notebook_occluder=True)
+    seen = simulate_recording(scenario, dataclasses.replace(SMALL, width=128), seed=1, name="passing")
     assert seen.truth is not None
     area = np.sum(np.asarray(seen.truth.labels) == 1, axis=(1, 2))
     time_s = seen.frame_time_s()
@@ -144,25 +145,25 @@ def test_the_notebook_hides_the_object_and_lets_it_be_seen_again():
     assert after > 0.5 * before
 
 
-def test_still_tags_are_read_but_not_labelled():
-    filmed = _tell("handheld", num_still_tags=5)
-    assert len(filmed.world.tags) == 6
-    labelled = [tag.epc for tag in filmed.world.tags if filmed.world.bodies[tag.body].label]
+def test_static_tags_are_read_but_not_labelled():
+    scenario = _build("handheld", num_static_tags=5)
+    assert len(scenario.world.tags) == 6
+    labelled = [tag.epc for tag in scenario.world.tags if scenario.world.bodies[tag.body].label]
     assert len(labelled) == 1
-    recording = film(filmed, SMALL, seed=3, name="still")
+    recording = simulate_recording(scenario, SMALL, seed=3, name="still")
     assert recording.truth is not None
     assert set(recording.truth.tag_to_label) == set(labelled)
     assert len(recording.reads.epcs) >= 3  # far ones are too weak
 
 
-def test_tracks_are_as_far_apart_as_asked():
-    filmed = _tell("tabletop", num_objects=2, tracks="parallel", spacing_m=0.164)
-    one, other = (_object(filmed, number).poses.position_m for number in (0, 1))
+def test_tracks_are_at_the_given_distance():
+    scenario = _build("tabletop", num_objects=2, tracks="parallel", spacing_m=0.164)
+    one, other = (_object(scenario, number).poses.position_m for number in (0, 1))
     np.testing.assert_allclose(np.abs(one[:, 0] - other[:, 0]), 0.164, atol=1e-9)
     np.testing.assert_allclose(one[:, 1], other[:, 1], atol=1e-9)
 
 
-def test_a_film_is_a_recording_with_its_truth(two):
+def test_a_simulated_recording_has_its_truth(two):
     two.check()
     truth = two.truth
     assert truth is not None
@@ -185,11 +186,11 @@ def test_a_film_is_a_recording_with_its_truth(two):
     assert np.isnan(np.asarray(truth.backward_flow_px[0])).all()
 
 
-def test_reads_are_coherent_with_the_true_range_and_not_with_another(told, two):
-    """Held against the path at every hundredth of a second: frames are too far apart for a waving hand."""
-    antenna = np.asarray(told.antennas_m[0])
-    time_s = np.arange(told.world.num_steps) * STEP_S
-    ranges = {tag.epc: np.linalg.norm(tag_path(told.world, tag) - antenna, axis=1) for tag in told.world.tags}
+def test_reads_are_coherent_with_the_true_range_and_not_with_another(waved, two):
+    """Compared with the path at every hundredth of a second: frames are too far apart for a waving hand."""
+    antenna = np.asarray(waved.antennas_m[0])
+    time_s = np.arange(waved.world.num_steps) * STEP_S
+    ranges = {tag.epc: np.linalg.norm(tag_path(waved.world, tag) - antenna, axis=1) for tag in waved.world.tags}
     epcs = list(ranges)
     for number, epc in enumerate(epcs):
         reads = two.reads.select(epc)
@@ -208,28 +209,30 @@ def test_reads_are_coherent_with_the_true_range_and_not_with_another(told, two):
 
         own, other = score(ranges[epc]), score(ranges[epcs[1 - number]])
         assert own > other
-        if np.median(reads.rssi_dbm) > -60:  # a tag in a fade hears its reflections as well
+        if np.median(reads.rssi_dbm) > -60:  # in a fade, reflections matter
             assert own > 0.95
             assert own > other + 0.2
 
 
 @pytest.mark.parametrize("shutter_s", [0.0, 0.02])
-def test_a_film_without_shadows_has_none(told, shutter_s):
+def test_shadows_can_be_disabled(waved, shutter_s):
     capture = dataclasses.replace(SMALL, frame_rate_hz=1.0, shutter_s=shutter_s)
     dark, lit = (
-        film(told, dataclasses.replace(capture, shadows=shadows), seed=2, name="x", num_frames=2).colour[1]
+        simulate_recording(waved, dataclasses.replace(capture, shadows=shadows), seed=2, name="x", num_frames=2).colour[
+            1
+        ]
         for shadows in (True, False)
     )
     assert np.mean(np.asarray(lit, float) - np.asarray(dark, float)) > 1.0
 
 
-def test_lines_are_free_where_they_cross_nothing(told):
+def test_lines_are_free_where_they_cross_nothing(waved):
     rng = np.random.default_rng(0)
     low, high = np.array([0.0, -2.2, 0.0]), np.array([5.0, 2.2, 2.4])
     start, end = rng.uniform(low, high, (2, 2000, 3))
-    steps = rng.integers(0, told.world.num_steps, 2000)
-    crossed = line_of_sight(told.world, start, end, steps, exclude=(2,)).crossed.any(axis=1)
-    free = is_free(told.world, start, end, steps, exclude=(2,))
+    steps = rng.integers(0, waved.world.num_steps, 2000)
+    crossed = line_of_sight(waved.world, start, end, steps, exclude=(2,)).crossed.any(axis=1)
+    free = is_free(waved.world, start, end, steps, exclude=(2,))
     assert 0.2 < free.mean() < 0.97
     np.testing.assert_array_equal(free, ~crossed)
 
@@ -250,88 +253,88 @@ def test_surface_points_lie_on_the_surface(kind):
     )
 
 
-def test_what_a_camera_sees_by_geometry_is_what_it_sees_by_rays():
-    """A notebook passes before a bottle: the share in sight falls and rises with the pixels in its mask."""
-    filmed = _tell("handheld", 6.0, kinds=("bottle",), passing=True)
-    view = look_at(kinect_v2_intrinsics(256), filmed.camera_position_m, filmed.camera_look_at_m)
-    stage, looks = Stage(filmed.world), steps_every(filmed.world, 0.1)
-    share = seen_share(filmed.world, (filmed.world.tags[0].body,), view, looks)
+def test_visibility_by_geometry_agrees_with_ray_casting():
+    """A notebook passes in front of a bottle: the visible fraction falls and rises with the pixels in its mask."""
+    scenario = _build("handheld", 6.0, kinds=("bottle",), notebook_occluder=True)
+    view = look_at(kinect_v2_intrinsics(256), scenario.camera_position_m, scenario.camera_look_at_m)
+    raycaster, looks = Raycaster(scenario.world), sampled_steps(scenario.world, 0.1)
+    fraction = visible_fraction(scenario.world, (scenario.world.tags[0].body,), view, looks)
     area = []
     for step in looks:
-        stage.pose(int(step))
-        area.append(np.sum(stage.labels(stage.cast(view)) == 1))
+        raycaster.pose(int(step))
+        area.append(np.sum(raycaster.labels(raycaster.cast(view)) == 1))
     area = np.array(area)
-    assert looks[-1] == filmed.world.num_steps - 1
-    assert np.all(area[share == 0] <= 2)
-    assert np.all(area[share > 0.5] > 10)
-    assert np.corrcoef(share, area)[0, 1] > 0.8
+    assert looks[-1] == scenario.world.num_steps - 1
+    assert np.all(area[fraction == 0] <= 2)
+    assert np.all(area[fraction > 0.5] > 10)
+    assert np.corrcoef(fraction, area)[0, 1] > 0.8
     # Turned to either side, up, down or round, the camera has it no longer in its picture.
-    toward = np.mean(filmed.world.bodies[filmed.world.tags[0].body].poses.position_m[:20], axis=0) - view.position_m
+    toward = np.mean(scenario.world.bodies[scenario.world.tags[0].body].poses.position_m[:20], axis=0) - view.position_m
     course, fall = np.arctan2(toward[1], toward[0]), np.arctan2(-toward[2], np.hypot(toward[0], toward[1]))
     for aside, down in ((0.0, 0.0), (0.9, 0.0), (-0.9, 0.0), (0.0, 0.8), (0.0, -0.8), (np.pi, -2 * fall)):
         yaw, dip = course + aside, fall + down
         ahead = np.array([np.cos(yaw) * np.cos(dip), np.sin(yaw) * np.cos(dip), -np.sin(dip)])
         turned = look_at(kinect_v2_intrinsics(256), view.position_m, view.position_m + ahead)
-        seen = seen_share(filmed.world, (filmed.world.tags[0].body,), turned, looks[:3])
+        seen = visible_fraction(scenario.world, (scenario.world.tags[0].body,), turned, looks[:3])
         assert seen.all() if aside == down == 0 else not seen.any()
-    np.testing.assert_array_equal(stretches(np.array([1, 1, 0, 1, 0, 0, 1], bool)), [[0, 2], [3, 4], [6, 7]])
-    assert len(stretches(np.zeros(4, bool))) == 0
+    np.testing.assert_array_equal(intervals(np.array([1, 1, 0, 1, 0, 0, 1], bool)), [[0, 2], [3, 4], [6, 7]])
+    assert len(intervals(np.zeros(4, bool))) == 0
 
 
-def test_trains_that_cannot_be_hidden_so_often_are_refused():
+def test_too_many_traces_or_people_are_refused():
     with pytest.raises(ValueError, match=r"leave train 1 4 traces in 1\.5 s; give it more time"):
-        _tell("tabletop", 1.5, num_objects=2, num_traces=4)
+        _build("tabletop", 1.5, num_objects=2, num_traces=4)
     with pytest.raises(ValueError, match=r"No way in and out in 3\.0 s for person 1 of 2"):
-        _tell("enter_leave", 3.0)
+        _build("enter_leave", 3.0)
     with pytest.raises(ValueError, match="place for 1 to 2"):
-        _tell("enter_leave", 15.0, num_people=3)
+        _build("enter_leave", 15.0, num_people=3)
 
 
-def test_still_tags_lie_near_the_antenna():
-    filmed = _tell("handheld", room="office", num_still_tags=12)
-    antenna = np.array(filmed.antennas_m[0])
-    away = [np.linalg.norm(tag_path(filmed.world, tag)[0] - antenna) for tag in filmed.world.tags[1:]]
+def test_static_tags_lie_near_the_antenna():
+    scenario = _build("handheld", room="office", num_static_tags=12)
+    antenna = np.array(scenario.antennas_m[0])
+    away = [np.linalg.norm(tag_path(scenario.world, tag)[0] - antenna) for tag in scenario.world.tags[1:]]
     assert max(away) < 5.2
 
 
 def test_ceiling_antennas_look_down():
-    shop, meeting = _tell("shop_exit"), _tell("handheld")
+    shop, meeting = _build("shop_exit"), _build("handheld")
     np.testing.assert_array_equal(shop.antenna_axes, [[0.0, 0.0, -1.0]] * 3)
     assert meeting.antenna_axes is None
-    reads = film(shop, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="down").reads
+    reads = simulate_recording(shop, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="down").reads
     up = dataclasses.replace(shop, antenna_axes=((0.0, 0.0, 1.0),) * 3)
-    fewer = film(up, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="up").reads
+    fewer = simulate_recording(up, dataclasses.replace(SMALL, frame_rate_hz=1.0), seed=1, name="up").reads
     assert fewer.num_reads < 0.7 * reads.num_reads
 
 
-def test_the_same_seed_films_the_same_bytes():
-    one, other = (film(_tell("tabletop", 1.0), SMALL, seed=5, name="x") for _ in range(2))
+def test_the_same_seed_gives_the_same_bytes():
+    one, other = (simulate_recording(_build("tabletop", 1.0), SMALL, seed=5, name="x") for _ in range(2))
     np.testing.assert_array_equal(one.colour, other.colour)
     np.testing.assert_array_equal(one.depth, other.depth)
     np.testing.assert_array_equal(one.reads.phase_rad, other.reads.phase_rad)
-    another = film(_tell("tabletop", 1.0), SMALL, seed=6, name="x")
+    another = simulate_recording(_build("tabletop", 1.0), SMALL, seed=6, name="x")
     assert not np.array_equal(one.colour, another.colour)
 
 
-def test_two_objects_in_one_place_are_refused(told):
-    first = _object(told, 0)
+def test_two_objects_at_one_spot_are_refused(waved):
+    first = _object(waved, 0)
     twin = dataclasses.replace(first, name="twin", label=9)
-    world = dataclasses.replace(told.world, bodies=(*told.world.bodies, twin))
+    world = dataclasses.replace(waved.world, bodies=(*waved.world.bodies, twin))
     with pytest.raises(ValueError, match="box and twin start 0 mm apart"):
         world.check()
-    lost = dataclasses.replace(told.world.tags[0], position_m=(9.0, 0.0, 0.0))
+    lost = dataclasses.replace(waved.world.tags[0], position_m=(9.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="leaves the room"):
-        dataclasses.replace(told.world, tags=(lost,)).check()
+        dataclasses.replace(waved.world, tags=(lost,)).check()
     with pytest.raises(ValueError, match="A world of 0 steps"):
-        dataclasses.replace(told.world, num_steps=0).check()
+        dataclasses.replace(waved.world, num_steps=0).check()
 
 
-def test_impossible_films_are_refused():
-    filmed = _tell("tabletop", 1.0)
+def test_impossible_captures_are_refused():
+    scenario = _build("tabletop", 1.0)
     with pytest.raises(ValueError, match="500 frames asked for; the world lasts for 6"):
-        film(filmed, SMALL, seed=1, name="x", num_frames=500)
+        simulate_recording(scenario, SMALL, seed=1, name="x", num_frames=500)
     with pytest.raises(ValueError, match="0 frames asked for"):
-        film(filmed, SMALL, seed=1, name="x", num_frames=0)
+        simulate_recording(scenario, SMALL, seed=1, name="x", num_frames=0)
     with pytest.raises(ValueError, match="Unknown sensor 'lidar'; known are kinect_v2"):
         CaptureSettings(sensor="lidar")
     with pytest.raises(ValueError, match="Unknown illumination"):

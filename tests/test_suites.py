@@ -16,17 +16,18 @@ import yaml
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.recording import RecordingError
 from tagjax.recording.store import open_recording
-from tagjax.sim._shop import EXIT_X_M
 from tagjax.sim.contact_sheet import save_sheet
-from tagjax.sim.objects import bounds
-from tagjax.sim.planar import PlanarSettings, open_planar, planar_trials
-from tagjax.sim.raycast import Stage, look_at
-from tagjax.sim.record import film
-from tagjax.sim.sensors import kinect_v2_intrinsics
+from tagjax.sim.radio.planar import PlanarSettings, open_planar, planar_trials
+from tagjax.sim.record import simulate_recording
+from tagjax.sim.rendering.raycast import Raycaster
+from tagjax.sim.rendering.sensors import kinect_v2_intrinsics
+from tagjax.sim.rendering.viewpoint import look_at
+from tagjax.sim.rendering.visibility import intervals, sampled_steps, visible_fraction
 from tagjax.sim.stories import STORIES
-from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, make_suite, prepare, stage_item
-from tagjax.sim.visibility import seen_share, steps_every, stretches
-from tagjax.sim.world import STEP_S, tag_dipole, tag_path
+from tagjax.sim.stories.shop import EXIT_X_M
+from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, item_scenario, make_suite, prepare
+from tagjax.sim.world.bodies import STEP_S, tag_dipole, tag_path
+from tagjax.sim.world.objects import bounds
 
 FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
 
@@ -82,14 +83,14 @@ def _named(name: str) -> Suite:
     return _suite(FILES[0].parent / f"{name}.yaml")
 
 
-def _view(filmed, suite: Suite):
-    return look_at(suite.capture.intrinsics(), filmed.camera_position_m, filmed.camera_look_at_m)
+def _view(scenario, suite: Suite):
+    return look_at(suite.capture.intrinsics(), scenario.camera_position_m, scenario.camera_look_at_m)
 
 
-def _bodies(filmed) -> dict[str, list[int]]:
+def _bodies(scenario) -> dict[str, list[int]]:
     """Numbers of each person's limbs."""
     found: dict[str, list[int]] = {}
-    for number, body in enumerate(filmed.world.bodies):
+    for number, body in enumerate(scenario.world.bodies):
         if body.role == "person":
             found.setdefault(body.name, []).append(number)
     return found
@@ -100,16 +101,16 @@ def _speed(path_m: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_every_train_leaves_as_many_traces_as_its_variant_says():
-    """All items: stretches in which any point of the train is in the picture and in sight, among all bodies."""
+def test_every_train_has_the_number_of_traces_of_its_variant():
+    """All items: intervals in which any point of the train is within the picture and not occluded by any body."""
     suite = _named("separated_traces")
     assert {variant.settings["num_traces"] for variant in suite.variants} == {2, 3, 4}
     for item in suite.items():
-        filmed = stage_item(item)
-        looks = steps_every(filmed.world, 0.2)
-        for tag in filmed.world.tags:
-            seen = seen_share(filmed.world, (tag.body,), _view(filmed, suite), looks) > 0
-            shown, hidden = stretches(seen), stretches(~seen)
+        scenario = item_scenario(item)
+        looks = sampled_steps(scenario.world, 0.2)
+        for tag in scenario.world.tags:
+            seen = visible_fraction(scenario.world, (tag.body,), _view(scenario, suite), looks) > 0
+            shown, hidden = intervals(seen), intervals(~seen)
             assert len(shown) == item.variant.settings["num_traces"], item.name
             assert seen[0]
             assert seen[-1]
@@ -118,30 +119,30 @@ def test_every_train_leaves_as_many_traces_as_its_variant_says():
 
 
 @pytest.mark.parametrize("variant", ["two", "four"])
-def test_the_masks_of_a_film_come_and_go_as_often(variant):
+def test_the_masks_appear_and_disappear_as_often(variant):
     suite = _named("separated_traces")
     item = next(item for item in suite.items() if item.split == "test" and item.variant.name == variant)
-    filmed = stage_item(item)
+    scenario = item_scenario(item)
     capture = dataclasses.replace(suite.capture, width=96, frame_rate_hz=8.0)
-    truth = film(filmed, capture, seed=item.seed, name=item.name).truth
+    truth = simulate_recording(scenario, capture, seed=item.seed, name=item.name).truth
     assert truth is not None
     for label in (1, 2):
         shown = np.any(np.asarray(truth.labels) == label, axis=(1, 2))
-        assert len(stretches(shown)) == item.variant.settings["num_traces"]
+        assert len(intervals(shown)) == item.variant.settings["num_traces"]
         np.testing.assert_array_equal(shown, truth.visible[label])
 
 
 @pytest.mark.slow
-def test_everybody_comes_in_and_leaves():
-    """All items: no limb, no object is in the picture at either end; each person walks about in it between."""
+def test_every_person_enters_and_leaves():
+    """All items: no limb and no object is visible at either end; each person is visible in between."""
     suite = _named("enter_leave")
     for item in suite.items():
-        filmed = stage_item(item)
-        world, view, looks = filmed.world, _view(filmed, suite), steps_every(filmed.world, 0.3)
-        people = _bodies(filmed)
+        scenario = item_scenario(item)
+        world, view, looks = scenario.world, _view(scenario, suite), sampled_steps(scenario.world, 0.3)
+        people = _bodies(scenario)
         assert len(people) == len(world.tags) == suite.settings["num_people"]
         for limbs, tag in zip(people.values(), world.tags, strict=True):
-            seen = seen_share(world, (*limbs, tag.body), view, looks) > 0
+            seen = visible_fraction(world, (*limbs, tag.body), view, looks) > 0
             assert not seen[:2].any(), item.name
             assert not seen[-2:].any(), item.name
             assert seen.sum() * 0.3 > 3.0, item.name
@@ -161,19 +162,19 @@ def test_everybody_comes_in_and_leaves():
         assert min(gap.min() for gap in apart) > 0.5
 
 
-def test_a_film_of_a_door_starts_and_ends_empty():
+def test_a_recording_of_a_door_starts_and_ends_empty():
     suite = _named("enter_leave")
     item = next(item for item in suite.items() if item.split == "test")
-    filmed = stage_item(item)
-    stage = Stage(filmed.world)
-    view = look_at(kinect_v2_intrinsics(96), filmed.camera_position_m, filmed.camera_look_at_m)
-    roles = np.array([filmed.world.bodies[body].role for body in stage.geom_body])
+    scenario = item_scenario(item)
+    raycaster = Raycaster(scenario.world)
+    view = look_at(kinect_v2_intrinsics(96), scenario.camera_position_m, scenario.camera_look_at_m)
+    roles = np.array([scenario.world.bodies[body].role for body in raycaster.geom_body])
 
     def shown(step: float) -> int:
-        stage.pose(step)
-        return int(np.sum(np.isin(roles[np.maximum(stage.cast(view).geom, 0)], ("person", "object"))))
+        raycaster.pose(step)
+        return int(np.sum(np.isin(roles[np.maximum(raycaster.cast(view).geom, 0)], ("person", "object"))))
 
-    last = filmed.world.num_steps - 1
+    last = scenario.world.num_steps - 1
     assert [shown(0), shown(25), shown(last - 25), shown(last)] == [0, 0, 0, 0]
     assert shown(last // 2) > 50
 
@@ -184,35 +185,35 @@ def _shop_items(name: str, all_items: bool) -> list:
 
 
 @pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_shop_is_as_the_paper_has_it(all_items):
-    """One and the same shop; level tags; still ones on a box near the exit; carried ones leave, or never near the exit."""
+def test_the_shop_agrees_with_the_paper(all_items):
+    """The same shop always; level dipoles; static tags on a box near the exit; carried tags leave, or never come near it."""
     furniture: dict[str, set] = {}
     stayed = carried = 0
     for item in _shop_items("shop_exit", all_items):
-        asked = {"num_still_tags": 0, "num_bystanders": 0, **item.suite.settings, **item.variant.settings}
-        filmed = stage_item(item)
-        world, (exit_antenna, *_) = filmed.world, filmed.antennas_m
+        asked = {"num_static_tags": 0, "num_bystanders": 0, **item.suite.settings, **item.variant.settings}
+        scenario = item_scenario(item)
+        world, (exit_antenna, *_) = scenario.world, scenario.antennas_m
         assert exit_antenna[:2] == (EXIT_X_M, 0.0)
-        assert len(filmed.antennas_m) == 3
+        assert len(scenario.antennas_m) == 3
         furniture.setdefault("shop", set()).add(
             tuple(np.round([body.poses.position_m[0] for body in world.bodies if body.role != "object" and not body.label
                             and body.role != "person" and body.name != "grey box"], 6).ravel())
         )  # fmt: skip
         assert all(tag.dipole[2] == 0 for tag in world.tags), item.name
-        people = [world.bodies[limbs[0]].poses.position_m[:, :2] for limbs in _bodies(filmed).values()]
+        people = [world.bodies[limbs[0]].poses.position_m[:, :2] for limbs in _bodies(scenario).values()]
         assert len(people) == asked["num_people"] + asked["num_bystanders"]
         paths = [tag_path(world, tag) for tag in world.tags]
         still = [path[0] for path in paths if np.ptp(path, axis=0).max() < 0.01]
         moving = [path for path in paths if np.ptp(path, axis=0).max() >= 0.01]
-        assert len(still) == asked["num_still_tags"]
+        assert len(still) == asked["num_static_tags"]
         assert len(moving) == asked["num_people"] * asked["tags_each"]
         for place in still:
-            assert 0.0 < place[0] - EXIT_X_M < asked["still_within_m"] + 0.3, item.name
+            assert 0.0 < place[0] - EXIT_X_M < asked["static_within_m"] + 0.3, item.name
             assert place[2] < 1.3
         for path in moving:
             stayed += path[:, 0].min() > EXIT_X_M + 0.3
             carried += 1
-            # Whoever leaves does so before the recording ends, and walks on for half a metre.
+            # People who leave do so before the recording ends, and walks on for half a metre.
             assert path[:, 0].min() > EXIT_X_M + 0.3 or path[-1, 0] < EXIT_X_M - 0.5, item.name
         for path in people[asked["num_people"] :]:
             # A bystander comes near the exit's line and never beyond it.
@@ -228,15 +229,15 @@ def test_the_shop_is_as_the_paper_has_it(all_items):
 
 
 @pytest.mark.slow
-def test_the_exit_hears_the_still_tags_all_the_time():
-    """First recordings: at least a read by the exit's antenna in every second, of every tag on the box."""
+def test_the_exits_antenna_reads_the_static_tags_all_the_time():
+    """First recordings: at least one read by the exit's antenna in every second, of every tag on the box."""
     for item in _shop_items("shop_exit", all_items=False):
-        filmed = stage_item(item)
-        still = {tag.epc for tag in filmed.world.tags if np.ptp(tag_path(filmed.world, tag), axis=0).max() < 0.01}
+        scenario = item_scenario(item)
+        still = {tag.epc for tag in scenario.world.tags if np.ptp(tag_path(scenario.world, tag), axis=0).max() < 0.01}
         if not still:
             continue
         capture = dataclasses.replace(item.suite.capture, width=32, frame_rate_hz=2.0)
-        reads = film(filmed, capture, seed=item.seed, name=item.name).reads
+        reads = simulate_recording(scenario, capture, seed=item.seed, name=item.name).reads
         for epc in still:
             mine = (reads.epc == epc) & (reads.antenna == 1)
             second = np.unique(np.floor(reads.time_ns[mine] * 1e-9 - reads.time_ns[0] * 1e-9))
@@ -244,15 +245,15 @@ def test_the_exit_hears_the_still_tags_all_the_time():
 
 
 @pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_thing_goes_from_hand_to_hand_and_onto_a_box(all_items):
-    """It is with the first person until they meet, with the second at once after, then at rest, and both leave."""
+def test_an_object_is_handed_over_and_put_onto_a_box(all_items):
+    """The first person holds it until they meet, then the second one, then it is stationary; both people leave."""
     for item in _shop_items("shop_handover", all_items):
-        filmed = stage_item(item)
-        world = filmed.world
+        scenario = item_scenario(item)
+        world = scenario.world
         (tag,) = world.tags
         assert tag.dipole[2] == 0
         path = tag_path(world, tag)
-        one, other = (world.bodies[limbs[0]].poses.position_m for limbs in _bodies(filmed).values())
+        one, other = (world.bodies[limbs[0]].poses.position_m for limbs in _bodies(scenario).values())
         near = [np.linalg.norm(path[:, :2] - person[:, :2], axis=1) for person in (one, other)]
         meet = int(0.25 * item.suite.duration_s / STEP_S)
         assert near[0][: meet - 20].max() < 0.6, item.name
@@ -271,10 +272,10 @@ def test_a_thing_goes_from_hand_to_hand_and_onto_a_box(all_items):
         assert np.linalg.norm(one - other, axis=1).min() > 0.6, item.name
 
 
-def test_the_grid_is_a_level_label_both_ways_round():
-    filmed = stage_item(_shop_items("shop_grid", all_items=False)[0])
-    (tag,) = filmed.world.tags
-    path, axis = tag_path(filmed.world, tag), tag_dipole(filmed.world, tag)
+def test_the_grid_has_a_level_dipole_in_two_directions():
+    scenario = item_scenario(_shop_items("shop_grid", all_items=False)[0])
+    (tag,) = scenario.world.tags
+    path, axis = tag_path(scenario.world, tag), tag_dipole(scenario.world, tag)
     np.testing.assert_allclose(axis[:, 2], 0, atol=1e-9)
     rests = np.all(np.abs(np.diff(path, axis=0)) < 1e-9, axis=1)
     places = np.unique(np.round(path[1:][rests][:, :2], 2), axis=0)
@@ -283,21 +284,21 @@ def test_the_grid_is_a_level_label_both_ways_round():
     for place in places:
         here = np.flatnonzero(rests & np.all(np.abs(path[1:, :2] - place) < 0.01, axis=1))
         # The last one is kept to the end.
-        here = here[: round(suite.settings["rest_s"] / STEP_S) - 1]
+        here = here[: round(suite.settings["pause_s"] / STEP_S) - 1]
         along = np.abs(axis[1:][here, 0])
         assert 0.4 < along.mean() < 0.6
         np.testing.assert_allclose(along * (1 - along), 0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("name", "variant"), [("planar_tracks", "three"), ("shop_exit", "sp_mt_4")])
-def test_things_do_not_pass_through_each_other(name, variant):
-    """All items: the boxes round two things, turned with them but taken as upright, never overlap."""
+def test_objects_do_not_pass_through_each_other(name, variant):
+    """All items: the bounding boxes of two objects, rotated about the vertical, never overlap."""
     for item in _named(name).items():
         if item.variant.name != variant:
             continue
-        filmed = stage_item(item)
-        things = [filmed.world.bodies[tag.body] for tag in filmed.world.tags]
-        for one, other in itertools.combinations(things, 2):
+        scenario = item_scenario(item)
+        objects = [scenario.world.bodies[tag.body] for tag in scenario.world.tags]
+        for one, other in itertools.combinations(objects, 2):
             (low, high), (bottom, top) = bounds(one.shapes), bounds(other.shapes)
             between = one.poses.position_m - other.poses.position_m
             across = (
@@ -308,33 +309,33 @@ def test_things_do_not_pass_through_each_other(name, variant):
 
 
 @pytest.mark.ci
-def test_people_walk_as_fast_as_the_suite_says():
-    """All items: the asked speed is reached on the legs and kept there; what is traced is the person, with a badge."""
+def test_people_walk_at_the_speed_of_the_suite():
+    """All items: the given speed is reached and kept on the straight parts; the labelled object is the person, with a badge."""
     for item in (suite := _named("speed")).items():
-        filmed = stage_item(item)
+        scenario = item_scenario(item)
         asked = item.variant.settings["speed_m_s"]
-        limbs = [filmed.world.bodies[i] for i in next(iter(_bodies(filmed).values()))]
+        limbs = [scenario.world.bodies[i] for i in next(iter(_bodies(scenario).values()))]
         assert {limb.label for limb in limbs} == {1}, item.name
         walker = _speed(limbs[0].poses.position_m[:, :2])
-        (tag,) = filmed.world.tags
-        assert filmed.world.bodies[tag.body] in limbs, item.name
-        badge = tag_path(filmed.world, tag)
+        (tag,) = scenario.world.tags
+        assert scenario.world.bodies[tag.body] in limbs, item.name
+        badge = tag_path(scenario.world, tag)
         assert walker.max() == pytest.approx(asked, rel=0.02), item.name
         assert np.mean(walker > 0.95 * asked) > 0.15, item.name
         assert np.percentile(walker, 75) > 0.75 * asked, item.name
         # Both ways: towards the sensor and away.
-        rate = np.diff(np.linalg.norm(badge - np.array(filmed.camera_position_m), axis=1)) / STEP_S
+        rate = np.diff(np.linalg.norm(badge - np.array(scenario.camera_position_m), axis=1)) / STEP_S
         assert rate.min() < -0.7 * asked, item.name
         assert rate.max() > 0.6 * asked or suite.duration_s * asked < 3.5, item.name
 
 
-def test_hands_wave_as_fast_as_the_suite_says():
-    """All items: at rest for 2 s, then a peak of exactly the asked speed within the push that it needs."""
+def test_hands_wave_at_the_speed_of_the_suite():
+    """All items: stationary for 2 s, then exactly the given peak speed within the acceleration bound."""
     suite = _named("velocity_threshold")
     assert sorted(variant.settings["speed_m_s"] for variant in suite.variants) == [0.5, 2.5]
     for item in suite.items():
-        filmed = stage_item(item)
-        path = filmed.world.bodies[filmed.world.tags[0].body].poses.position_m
+        scenario = item_scenario(item)
+        path = scenario.world.bodies[scenario.world.tags[0].body].poses.position_m
         asked, speed = item.variant.settings["speed_m_s"], _speed(path)
         assert speed[: round(1.9 / STEP_S)].max() < 0.05, item.name
         assert speed.max() == pytest.approx(asked, rel=0.03), item.name
@@ -343,22 +344,22 @@ def test_hands_wave_as_fast_as_the_suite_says():
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_every_suite_finds_room_for_its_story(path):
+def test_every_suite_has_a_scenario_for_each_item(path):
     suite = _suite(path)
     if suite.story == PLANAR:
         return
     shorter_s = min(suite.duration_s, max(5.0, suite.smoke_s))
     suite = dataclasses.replace(suite, duration_s=shorter_s, counts=Counts(0, 0, 1))
     for item in suite.items():
-        stage_item(item).world.check()
+        item_scenario(item).world.check()
 
 
 @pytest.mark.parametrize("number", [0, 7, 19])
-def test_trains_of_like_phase_differ_by_half_a_wavelength_in_range(number):
+def test_trains_of_equal_phase_differ_by_half_a_wavelength_in_range(number):
     suite = _named("half_wavelength")
     item = next(item for item in suite.items() if item.split == "test" and item.number == number)
     capture = dataclasses.replace(suite.capture, width=32, frame_rate_hz=3.0)
-    truth = film(stage_item(item), capture, seed=item.seed, name=item.name).truth
+    truth = simulate_recording(item_scenario(item), capture, seed=item.seed, name=item.name).truth
     assert truth is not None
     one, other = (np.asarray(range_m) for range_m in truth.tag_range_m.values())
     # Half a wavelength of the band's middle, 915 MHz, is 164 mm.
@@ -366,34 +367,36 @@ def test_trains_of_like_phase_differ_by_half_a_wavelength_in_range(number):
     assert np.ptp(one) > 0.05
 
 
-def test_a_glance_shows_the_worlds_of_the_suite():
+def test_a_preview_shows_the_worlds_of_the_suite():
     suite = _named("velocity_threshold")
-    glance = suite.glance()
+    preview = suite.preview()
     first = [item for item in suite.items() if item.split == "test" and item.number == 0]
-    assert [(item.name, item.seed) for item in glance.items()] == [(item.name, item.seed) for item in first]
-    recording = film(stage_item(glance.items()[0]), dataclasses.replace(glance.capture, width=32), seed=1, name="x")
+    assert [(item.name, item.seed) for item in preview.items()] == [(item.name, item.seed) for item in first]
+    recording = simulate_recording(
+        item_scenario(preview.items()[0]), dataclasses.replace(preview.capture, width=32), seed=1, name="x"
+    )
     assert recording.num_frames == 6
-    assert [item.split for item in _named("corpus").glance().items()] == ["train"] * 10
+    assert [item.split for item in _named("corpus").preview().items()] == ["train"] * 10
 
 
 def test_readers_and_stories_differ_by_variant():
     suite = _tiny(
         duration_s=2.0,
-        reader={"region": "china", "flip_share": 0.0},
+        reader={"region": "china", "flip_probability": 0.0},
         variants=(
             Variant("one", {"num_objects": 1}),
-            Variant("two", {"num_objects": 2}, reader={"flip_share": 0.12}),
-            Variant("hand", {"still_s": 0.2}, story="handheld"),
+            Variant("two", {"num_objects": 2}, reader={"flip_probability": 0.12}),
+            Variant("hand", {"stationary_s": 0.2}, story="handheld"),
         ),
     )
-    one, two, hand = (stage_item(item) for item in suite.items())
-    assert [filmed.inventory.flip_share for filmed in (one, two, hand)] == [0.0, 0.12, 0.0]
-    assert {filmed.inventory.region for filmed in (one, two, hand)} == {"china"}
+    one, two, hand = (item_scenario(item) for item in suite.items())
+    assert [scenario.inventory.flip_probability for scenario in (one, two, hand)] == [0.0, 0.12, 0.0]
+    assert {scenario.inventory.region for scenario in (one, two, hand)} == {"china"}
     assert not any(body.role == "person" for body in two.world.bodies)
     assert any(body.role == "person" for body in hand.world.bodies)
 
 
-def test_a_killed_run_goes_on_and_repeats_exactly(tmp_path):
+def test_a_killed_run_resumes_and_repeats_exactly(tmp_path):
     suite = _tiny()
     made = make_suite(suite, tmp_path / "a")
     assert [one.name for one in made] == ["tiny-one-test-0", "tiny-two-test-0"]
@@ -438,7 +441,7 @@ def test_every_suite_in_small(path, tmp_path):
             open_recording(item.path(tmp_path)).check()
 
 
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
+def test_a_folder_with_other_contents_is_left_unchanged(tmp_path):
     home = tmp_path / "tiny"
     home.mkdir()
     (home / "thesis.txt").write_text("precious")
@@ -453,7 +456,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
     assert json.loads((home / MANIFEST).read_text())["seed"] == 5
 
 
-def test_a_suite_may_grow(tmp_path):
+def test_counts_of_a_suite_may_grow(tmp_path):
     few, more = (dataclasses.replace(_tiny(), counts=Counts(0, 0, number)) for number in (1, 3))
     for item in prepare(few, tmp_path):
         item.path(tmp_path).mkdir(parents=True)
@@ -479,8 +482,8 @@ def test_impossible_suites_are_refused():
     with pytest.raises(ConfigError, match="unknown key 'durations'"):
         from_mapping(Suite, {**given, "durations": 3})
     full = Suite("x", "x", "x", "tabletop", 1, settings={"num_objects": 40}, counts=Counts(0, 0, 1))
-    with pytest.raises(ValueError, match=r"x-all-test-0 .*draws in vain.*do not fit"):
-        stage_item(full.items()[0])
+    with pytest.raises(ValueError, match=r"x-all-test-0 .*draws failed.*do not fit"):
+        item_scenario(full.items()[0])
 
 
 def test_planar_trials_follow_the_geometry(tmp_path):

@@ -147,8 +147,8 @@ def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
     storage, folder = f"sqlite:///{tmp_path / 'new' / 'optuna.db'}", tmp_path / "sweep"
     assert trials_left(3, storage, "one", str(folder)) == 3
     study = optuna.create_study(study_name="one", storage=storage)
-    study.tell(study.ask(), 0.5)
-    study.tell(study.ask(), state=optuna.trial.TrialState.FAIL)
+    study.build_scenario(study.ask(), 0.5)
+    study.build_scenario(study.ask(), state=optuna.trial.TrialState.FAIL)
     study.ask()  # killed
     assert trials_left(3, storage, "one", str(folder)) == 2
     assert trials_left(3, storage, "other", str(folder)) == 3
@@ -241,7 +241,7 @@ SUITE = {
     "story": "handheld",
     "seed": 1,
     "duration_s": 3.0,
-    "settings": {"still_s": 0.4},
+    "settings": {"stationary_s": 0.4},
     "counts": {"train": 0, "validation": 0, "test": 1},
     "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
 }

@@ -17,7 +17,7 @@ from tagjax.tagattention.frame_trace import describe
 from tagjax.tagattention.motion import empty_motion, push_gather, push_splat
 from tagjax.tagattention.paper import FLOOR, TagAttentionPaper
 from tagjax.tracing.clips import load_clip
-from tagjax.tracing.tracer import Camera, Frame, Later, trace
+from tagjax.tracing.tracer import BackwardMessage, Camera, Frame, trace
 
 
 def _learnable(**changed):
@@ -52,7 +52,7 @@ def test_the_learnable_tracer_finds_both_objects(clip, said):
         inside = np.zeros_like(mask)
         inside[y0 : y1 + 1, x0 : x1 + 1] = True
         assert (mask & inside).sum() / (mask | inside).sum() > 0.6
-        assert bool(out.found[-1, tag])
+        assert bool(out.detected[-1, tag])
 
 
 def test_phases_alone_name_both_objects(clip):
@@ -111,7 +111,7 @@ def test_two_tags_of_one_thing_both_find_it(clip):
         covered = np.asarray(out.mask[-1, tag])
         assert covered[y0 : y1 + 1, x0 : x1 + 1].mean() > 0.6
         assert covered.sum() - covered[y0 : y1 + 1, x0 : x1 + 1].sum() < 0.3 * covered.sum()
-        assert bool(out.found[-1, tag])
+        assert bool(out.detected[-1, tag])
 
 
 @pytest.mark.ci
@@ -232,7 +232,7 @@ def test_gradients_reach_every_parameter_and_stay_finite_at_degenerate_input(cli
         for leaf in (*jax.tree.leaves(out), *jax.tree.leaves(gradient)):
             assert bool(jnp.isfinite(leaf).all()), what
         if what == "no depth":
-            assert not out.found.any()
+            assert not out.detected.any()
 
 
 def test_paper_update_is_equation_7(clip):
@@ -355,9 +355,9 @@ def test_even_odds_are_no_claim():
     mask, nothing = jnp.ones((3, 4, 5)), jnp.zeros((3, 3))
     confidence = jnp.asarray([0.5, 0.503, 0.51])
     out = describe(mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
-    assert out.found.tolist() == [False, False, True]
+    assert out.detected.tolist() == [False, False, True]
     empty = describe(0.0 * mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
-    assert not empty.found.any()
+    assert not empty.detected.any()
 
 
 def test_only_frames_and_reads_enter(clip):
@@ -368,4 +368,4 @@ def test_only_frames_and_reads_enter(clip):
     assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour", "later"} == set(
         Frame.__dataclass_fields__
     )
-    assert {"log_odds", "anchor", "moved"} == set(Later.__dataclass_fields__)
+    assert {"log_odds", "anchor", "moved"} == set(BackwardMessage.__dataclass_fields__)

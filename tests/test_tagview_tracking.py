@@ -371,14 +371,14 @@ def test_the_tracer_finds_names_and_places_every_tag():
     recording = _recording()
     said = [trace for _, trace in host_trace(_tracer(), recording, epcs=["B", "A"])]
     last = said[-1]
-    assert np.asarray(last.found).all()
+    assert np.asarray(last.detected).all()
     assert recording.truth is not None
     boxes = np.asarray(recording.truth.boxes_px)[-1][[1, 0]]
     np.testing.assert_allclose(last.box_px, boxes, atol=1.0)
     true_m = [recording.truth.tag_position_m[epc][-1] for epc in ("B", "A")]
     np.testing.assert_allclose(last.centre_m, true_m, atol=0.08)
     assert np.all(np.asarray(last.confidence) > 0.95)
-    assert not np.asarray(said[0].found).any()
+    assert not np.asarray(said[0].detected).any()
     ranges = [np.linalg.norm(recording.truth.tag_position_m["A"][i] - recording.antennas_m[0]) for i in (-2, -1)]
     assert float(last.step_m[1, 0]) == pytest.approx(ranges[1] - ranges[0], abs=0.012)
 
@@ -394,7 +394,7 @@ def test_a_known_height_places_tags_whatever_the_slope_says():
     for height_m in (None, HEIGHT_M):
         settings = dataclasses.replace(_tracer().settings, height_m=height_m)
         *_, (_, last) = host_trace(TagviewTracer(settings, detector=Perfect()), recording, epcs=["B", "A"])
-        assert np.asarray(last.found).all()
+        assert np.asarray(last.detected).all()
         place_m[height_m] = np.asarray(last.centre_m)
     assert np.all(place_m[None][:, 2] > 1.1 * HEIGHT_M)
     np.testing.assert_allclose(place_m[HEIGHT_M], true_m, atol=0.03)
@@ -431,11 +431,11 @@ def test_where_tagview_does_not_apply():
 def test_more_tags_than_things_and_nothing_in_sight():
     recording = _recording()
     alone = dataclasses.replace(recording, colour=np.full_like(np.asarray(recording.colour), 50))
-    assert not any(np.asarray(trace.found).any() for _, trace in host_trace(_tracer(), alone))
+    assert not any(np.asarray(trace.detected).any() for _, trace in host_trace(_tracer(), alone))
     one = _recording(1)
     both = one.with_reads(recording.reads)
     *_, (_, last) = host_trace(_tracer(), both)
-    np.testing.assert_array_equal(np.asarray(last.found), [True, False])
+    np.testing.assert_array_equal(np.asarray(last.detected), [True, False])
 
 
 def test_a_thing_that_was_hidden_is_named_again():

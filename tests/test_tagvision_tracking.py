@@ -160,7 +160,7 @@ def test_the_system_finds_names_and_outlines_what_is_tagged(drawn: Recording, sa
     late = [(number, trace) for number, trace in said if number >= 40]
     for number, trace in late:
         for tag, epc in enumerate(scenes.EPCS):
-            assert trace.found[tag]
+            assert trace.detected[tag]
             true = np.asarray(drawn.truth.labels)[number] == drawn.truth.tag_to_label[epc]
             mask = trace.mask[tag] > 0.5
             assert np.sum(mask & true) / np.sum(mask | true) > 0.7
@@ -307,7 +307,7 @@ def test_blobs_without_tags_and_tags_without_blobs() -> None:
         antennas_m=scenes.OVER.to_camera(scenes.ANTENNA[None]),
     )
     for _, trace in host_trace(TagVision(scenes.OVER, SYSTEM), recording):
-        assert not trace.found.any()
+        assert not trace.detected.any()
         assert not trace.mask.any()
         assert not trace.confidence.any()
 
@@ -318,7 +318,7 @@ def test_claims_become_a_trace() -> None:
     empty = Claim(np.zeros((6, 8), bool), np.zeros(3), 0.9)
     boxed = Claim(mask, np.array([1.0, 2.0, 3.0]), 0.3, box_px=np.array([0.0, 1.0, 2.0, 3.0]), step_m=0.1)
     trace = claims_to_trace([Claim(mask, np.full(3, np.nan), 0.8), None, empty, boxed], (6, 8))
-    assert trace.found.tolist() == [True, False, False, True]
+    assert trace.detected.tolist() == [True, False, False, True]
     assert trace.box_px[0].tolist() == [3, 2, 6, 3]
     assert trace.centre_px[0].tolist() == [4.5, 2.5]
     assert trace.box_px[3].tolist() == [0, 1, 2, 3]

@@ -19,9 +19,8 @@ from ..flow.named import make_flow
 from ..image.warp import gather, splat
 from ..radio.coherence import coherence
 from ..sim.flow_pairs import FlowPairSettings, flow_pairs
-from ..sim.record import CaptureSettings, film
-from ..sim.session import SceneSettings, simulate_recording
-from ..sim.stories import tell
+from ..sim.record import CaptureSettings, simulate_recording
+from ..sim.stories import build_scenario
 from ..tagattention import TagAttention
 from ..tagattention.segmentation import segment
 from ..tracing.clips import load_clip
@@ -143,7 +142,9 @@ def _coherence(settings: BenchmarkSettings) -> Timing:
 
 
 def _small_recording(settings: BenchmarkSettings):
-    return simulate_recording(SceneSettings(width=320, height=240, num_frames=24), seed=settings.seed)
+    scenario = build_scenario("walkers", np.random.default_rng(settings.seed), 3.0)
+    capture = CaptureSettings(sensor="xtion", width=320, frame_rate_hz=10.0)
+    return simulate_recording(scenario, capture, seed=settings.seed, name="benchmark", num_frames=24)
 
 
 def _radio(settings: BenchmarkSettings) -> Timing:
@@ -178,11 +179,15 @@ def _simulate(settings: BenchmarkSettings) -> Timing:
 
     The first frame, which renders what never moves, is left out; reads are too.
     """
-    filmed = tell("handheld", np.random.default_rng(settings.seed), 2.0, {"room": "office", "num_walkers": 1})
-    filmed = dataclasses.replace(filmed, world=dataclasses.replace(filmed.world, tags=()))
+    scenario = build_scenario(
+        "handheld", np.random.default_rng(settings.seed), 2.0, {"room": "office", "num_walkers": 1}
+    )
+    scenario = dataclasses.replace(scenario, world=dataclasses.replace(scenario.world, tags=()))
     stamps: list[float] = []
     capture = CaptureSettings(width=settings.width, flow=True, frame_rate_hz=15.0)
-    film(filmed, capture, seed=settings.seed, name="benchmark", on_frame=lambda: stamps.append(time.perf_counter()))
+    simulate_recording(
+        scenario, capture, seed=settings.seed, name="benchmark", on_frame=lambda: stamps.append(time.perf_counter())
+    )
     ours = float(np.median(np.diff(stamps))) * 1e3
     height = capture.intrinsics().height
     return Timing(f"simulated frame, {settings.width}x{height}, truth and flow on", ours, "4 frames/s", 250.0)

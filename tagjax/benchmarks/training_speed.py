@@ -14,7 +14,8 @@ import jax
 import numpy as np
 import optax
 
-from ..sim.session import SceneSettings, simulate_recording
+from ..sim.record import CaptureSettings, simulate_recording
+from ..sim.stories import build_scenario
 from ..tagattention import TagAttention
 from ..tracing.clips import Clip, ClipSettings, load_clip
 from ..training.loss import ObjectiveSettings
@@ -53,10 +54,12 @@ def step_cost(length: int, rematerialise: bool, repeats: int, seed: int) -> dict
 
 
 def _clip(length: int, seed: int) -> Clip:
-    """A clip of that length: a scene of three people with a tag each."""
-    scene = SceneSettings(width=_WIDTH, height=_HEIGHT, num_frames=length)
+    """A clip of that length: three people with a badge each."""
+    scenario = build_scenario("walkers", np.random.default_rng(seed), length / 10 + 1)
+    capture = CaptureSettings(sensor="xtion", width=_WIDTH, frame_rate_hz=10.0)
+    recording = simulate_recording(scenario, capture, seed=seed, name="training step", num_frames=length)
     settings = ClipSettings(stride=_STRIDE, flow="dis_ultrafast")
-    return load_clip(simulate_recording(scene, seed=seed), 0, length, **settings.arguments())
+    return load_clip(recording, 0, length, **settings.arguments())
 
 
 def _report_step(length: int, rematerialise: bool, repeats: int, seed: int) -> None:

@@ -22,7 +22,7 @@ from ..core.settings import ConfigError, from_mapping
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording.store import open_recording
 from ..report.report import plain
-from ..report.sweep import curve_panels, parameter_panels, worded
+from ..report.sweep import curve_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
 from ..tracing.clips import ClipSettings, clip_loader
 from ..training.run import make_tracer
@@ -133,7 +133,7 @@ def _items(config: SweepConfig, suite: Suite, tell: Callable[[str], None]) -> li
         suite,
         Path(config.out),
         splits=config.splits,
-        most=config.most,
+        max_per_variant=config.most,
         workers=config.workers,
         on_done=lambda made: tell(made.name),
     )
@@ -176,8 +176,8 @@ def frame_iou(result: RecordingResult) -> tuple[float | None, ...]:
     frames = list(result.frames.values())
     if not frames:
         return ()
-    iou = np.stack([np.where(one.found, one.iou, 0.0) for one in frames])
-    shown = np.stack([one.shown for one in frames])
+    iou = np.stack([np.where(one.detected, one.iou, 0.0) for one in frames])
+    shown = np.stack([one.visible for one in frames])
     count = shown.sum(axis=0)
     mean = (iou * shown).sum(axis=0) / np.maximum(count, 1)
     return tuple(round(float(value), 4) if n else None for value, n in zip(mean, count, strict=True))
@@ -202,7 +202,7 @@ def read_lines(path: Path) -> list[Line]:
 
 def said(point: Mapping[str, Value]) -> str:
     """A point of the grid in words."""
-    return ", ".join(f"{name}={worded(value)}" for name, value in point.items())
+    return ", ".join(f"{name}={value_text(value)}" for name, value in point.items())
 
 
 def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
@@ -235,7 +235,7 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
         writer = csv.DictWriter(file, heads)
         writer.writeheader()
         writer.writerows(rows)
-    cells = [[worded(row[head]) if head in config.grid else f"{row[head]:.3f}" for head in heads] for row in rows]
+    cells = [[value_text(row[head]) if head in config.grid else f"{row[head]:.3f}" for head in heads] for row in rows]
     text = [" | ".join(row) for row in (heads, ["---"] * len(heads), *cells)]
     (folder / "table.md").write_text("".join(f"| {row} |\n" for row in text), encoding="utf-8")
     points = config.points()

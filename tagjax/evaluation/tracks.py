@@ -158,7 +158,7 @@ def windows(scene: Scene, length_s: float, config: TracksConfig) -> list[Window]
     antenna, found = antenna_place(scene), []
     three = lambda place: np.concatenate([place, np.zeros((*place.shape[:-1], 1))], axis=-1)  # noqa: E731
     num = round(length_s * config.frame_rate_hz)
-    settings = ReaderSettings(region=config.region, flip_share=config.flip_share)
+    settings = ReaderSettings(region=config.region, flip_probability=config.flip_share)
     true_m = np.linalg.norm(three(scene.position_m) - antenna, axis=-1)
     noisy = scene.position_m + config.noise_m * rng.normal(size=scene.position_m.shape)
     seen_m = np.linalg.norm(three(noisy) - antenna, axis=-1)

@@ -1,6 +1,6 @@
-"""Scores of optical flow: end-point error against truth, and how well the second picture, brought back, fits the first.
+"""Scores of optical flow: end-point error against truth, and the photometric error of the second picture warped to the first.
 
-Host-side NumPy; sums over pixels as state -> merge -> result, so that pairs are scored one by one.
+Host-side NumPy; sums over pixels accumulate as state -> merge -> result, so that pairs are scored one by one.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from ..flow.pictures import as_unit
 from .tracking import MaskedMean
 
 OUTLIERS_PX = (1, 3, 5)
-"""End-point errors, pixels, above which shares of pixels are counted."""
+"""Thresholds of the end-point error, pixels, above which the fraction of pixels is counted."""
 
-FL_PX, FL_SHARE = 3.0, 0.05
-"""An outlier of KITTI 2015 (Menze and Geiger, CVPR 2015): further off than this, and than this share of the truth."""
+FL_PX, FL_FRACTION = 3.0, 0.05
+"""An outlier of KITTI 2015 (Menze and Geiger, CVPR 2015): an error above this, and above this fraction of the true length."""
 
 
 def endpoint_error(
@@ -34,7 +34,7 @@ def endpoint_error(
     known = np.all(np.isfinite(truth_px), axis=-1)
     bad = int(np.sum(known & ~np.all(np.isfinite(flow_px), axis=-1)))
     if bad:
-        raise ValueError(f"The flow of {bad} pixels is not finite; a flow says something of every pixel.")
+        raise ValueError(f"The flow of {bad} pixels is not finite; expected a finite flow at every pixel.")
     gap = np.where(known[..., None], flow_px, 0).astype(np.float64) - np.where(known[..., None], truth_px, 0)
     return np.where(known, np.linalg.norm(gap, axis=-1), np.nan)
 
@@ -46,8 +46,8 @@ def warped_error(
 ) -> tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
     """Mean over colours of |first(x) - second(x + flow)|, levels of 255, and where the target is in the picture.
 
-    Pictures are uint8, or floats from 0 to 1. Needs no truth, and is none: of two flows the truer one may have the
-    larger error where light changes or things are hidden.
+    Pictures are uint8, or floats from 0 to 1. Needs no truth. It is a proxy: where the light changes or pixels are
+    occluded, the more accurate of two flows may have the larger error.
     """
     height, width = first.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -59,7 +59,7 @@ def warped_error(
 
 @dataclasses.dataclass(frozen=True)
 class FlowScores:
-    """Summed scores of any number of pairs."""
+    """Accumulated scores of any number of pairs."""
 
     means: Mapping[str, MaskedMean] = dataclasses.field(default_factory=dict)
 
@@ -72,7 +72,7 @@ class FlowScores:
         *,
         moving_px: float = 0.5,
     ) -> FlowScores:
-        """The state of one pair: errors of all pixels, visible and hidden ones, moving and still ones; outliers.
+        """The state of one pair: errors of all pixels, visible and occluded ones, moving and static ones; outliers.
 
         A pixel moves if its true flow is longer than `moving_px`. Pixels of unknown flow (NaN) count nowhere. Errors as
         of `endpoint_error`.
@@ -87,7 +87,7 @@ class FlowScores:
         means = {name: MaskedMean.of(error, part) for name, part in parts.items()}
         for limit in OUTLIERS_PX:
             means[f"above_{limit}px"] = MaskedMean.of(np.asarray(error > limit, np.float64), known)
-        outlier = (error > FL_PX) & (error > FL_SHARE * length)
+        outlier = (error > FL_PX) & (error > FL_FRACTION * length)
         return cls({**means, "fl": MaskedMean.of(outlier.astype(np.float64), known)})
 
     @classmethod
@@ -97,7 +97,7 @@ class FlowScores:
         second: Shaped[np.ndarray, "height width 3"],
         flow_px: Float[np.ndarray, "height width 2"],
     ) -> FlowScores:
-        """The state of one pair without truth: `warped_error` over targets in the picture, and their share."""
+        """The state of one pair without truth: `warped_error` over targets in the picture, and their fraction."""
         error, inside = warped_error(first, second, flow_px)
         everywhere = np.ones_like(inside)
         return cls(

@@ -1,7 +1,7 @@
 """Tracking metrics against labelled truth: box IoU, centre error, mask J, identification, time to lock.
 
-Host-side NumPy. Every metric comes per frame with a validity mask, and is summed up as state -> merge -> result, so
-that clips, tags and recordings can be scored one by one and put together afterwards.
+Host-side NumPy. Every metric is computed per frame with a validity mask and accumulated as state -> merge -> result, so
+that clips, tags and recordings are scored one by one and merged afterwards.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, Integer, Shaped
 from ..recording import Truth
 
 REFERENCE_WIDTH_PX = 512
-"""Centre errors are given for a picture of this width (Kinect v2's depth camera, as in TagAttention)."""
+"""Centre errors are scaled to a picture of this width (Kinect v2's depth camera, as in TagAttention)."""
 
 
 def box_iou(
@@ -23,7 +23,7 @@ def box_iou(
 ) -> Float[np.ndarray, "*batch"]:
     """Intersection over union of boxes x0 y0 x1 y1 with inclusive pixel edges (TagAttention, Eq. 8).
 
-    Pixels have unit size, so a box spans x1 - x0 + 1. 0 where either box is NaN or turned inside out.
+    Pixels have unit size, so a box spans x1 - x0 + 1. 0 where either box is NaN or has a negative side.
     """
     a, b = np.asarray(box_a_px, np.float64), np.asarray(box_b_px, np.float64)
     side_a, side_b = a[..., 2:] - a[..., :2] + 1.0, b[..., 2:] - b[..., :2] + 1.0
@@ -40,7 +40,7 @@ def centre_error(
 ) -> Float[np.ndarray, "*batch"]:
     """Distance between box centres in pixels of a 512-pixel-wide picture; NaN where a box is NaN.
 
-    `width` is that of the picture the boxes are measured in.
+    `width` is the width of the picture to which the boxes belong, pixels.
     """
     a, b = np.asarray(box_a_px, np.float64), np.asarray(box_b_px, np.float64)
     gap = 0.5 * (a[..., :2] + a[..., 2:] - b[..., :2] - b[..., 2:])
@@ -50,7 +50,7 @@ def centre_error(
 def mask_iou(mask: Bool[np.ndarray, "height width"], labels: Integer[np.ndarray, "height width"], label: int) -> float:
     """Region similarity J: IoU of a mask with a labelled object, pixels labelled 255 (ignore) left out of both.
 
-    NaN where neither holds a pixel.
+    NaN where both are empty.
     """
     counted = labels != Truth.IGNORE
     predicted, true = mask & counted, labels == label
@@ -58,31 +58,31 @@ def mask_iou(mask: Bool[np.ndarray, "height width"], labels: Integer[np.ndarray,
     return float(np.sum(predicted & true) / union) if union else float("nan")
 
 
-def most_covered(
+def best_covered_label(
     mask: Bool[np.ndarray, "height width"], labels: Integer[np.ndarray, "height width"], *, min_pixels: int = 20
 ) -> int:
-    """The labelled object of which the mask covers the largest part; 0 if it covers none.
+    """The label of the object of which the mask covers the largest fraction; 0 if it covers none.
 
-    Objects that show fewer than `min_pixels` are passed over: a sliver is covered by chance.
+    Objects with fewer than `min_pixels` visible pixels are ignored: masks cover these by chance.
     """
-    shown = np.bincount(labels.reshape(-1), minlength=256).astype(np.float64)
+    area = np.bincount(labels.reshape(-1), minlength=256).astype(np.float64)
     covered = np.bincount(labels[mask], minlength=256).astype(np.float64)
-    shown[[0, Truth.IGNORE]] = covered[[0, Truth.IGNORE]] = 0
-    part = np.where(shown >= min_pixels, covered / np.maximum(shown, 1.0), 0.0)
-    return int(np.argmax(part)) if part.max() > 0 else 0
+    area[[0, Truth.IGNORE]] = covered[[0, Truth.IGNORE]] = 0
+    fraction = np.where(area >= min_pixels, covered / np.maximum(area, 1.0), 0.0)
+    return int(np.argmax(fraction)) if fraction.max() > 0 else 0
 
 
 def label_box(labels: Integer[np.ndarray, "height width"], label: int) -> Float[np.ndarray, " 4"]:
-    """Tight box x0 y0 x1 y1 (inclusive) around a labelled object; NaN if it does not show."""
-    found = labels == label
-    rows, columns = np.flatnonzero(found.any(axis=1)), np.flatnonzero(found.any(axis=0))
+    """Tight box x0 y0 x1 y1 (inclusive) around a labelled object; NaN if it is not visible."""
+    own = labels == label
+    rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
     if not len(rows):
         return np.full(4, np.nan)
     return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.float64)
 
 
-def known_area(labels: Integer[np.ndarray, "height width"]) -> Float[np.ndarray, " 4"]:
-    """Box x0 y0 x1 y1 (inclusive) of what is labelled: rows and columns at the edges that are all ignored are cut."""
+def labelled_area(labels: Integer[np.ndarray, "height width"]) -> Float[np.ndarray, " 4"]:
+    """Box x0 y0 x1 y1 (inclusive) of the labelled area: rows and columns at the edges that are all 255 (ignore) are cut."""
     known = labels != Truth.IGNORE
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     if not len(rows):
@@ -93,7 +93,7 @@ def known_area(labels: Integer[np.ndarray, "height width"]) -> Float[np.ndarray,
 def touches_border(
     box_px: Shaped[np.ndarray, "*batch 4"], area_px: Float[np.ndarray, " 4"], *, margin_px: float = 0.0
 ) -> Bool[np.ndarray, "*batch"]:
-    """Whether a box comes within `margin_px` of the edge of the known area, where the object may be cut off."""
+    """Whether a box is within `margin_px` of the edge of the labelled area, where the object may be cut off."""
     x0, y0, x1, y1 = np.moveaxis(np.asarray(box_px, np.float64), -1, 0)
     left, top, right, bottom = np.asarray(area_px) + margin_px * np.array([1.0, 1.0, -1.0, -1.0])
     return np.asarray((x0 <= left) | (y0 <= top) | (x1 >= right) | (y1 >= bottom))
@@ -109,7 +109,7 @@ def time_to_lock(
 ) -> float:
     """Seconds from the first valid frame to the first of `num_frames` valid frames in a row with IoU >= threshold.
 
-    Invalid frames are skipped: they neither break nor lengthen the row. Infinite if the object is never locked, NaN
+    Invalid frames are skipped: they neither interrupt nor lengthen the sequence. Infinite if there is no lock, NaN
     without a valid frame.
     """
     frames = np.flatnonzero(valid)
@@ -126,32 +126,34 @@ def time_to_lock(
 
 def times_to_recover(
     iou: Float[np.ndarray, " time"],
-    shown: Bool[np.ndarray, " time"],
+    visible: Bool[np.ndarray, " time"],
     time_s: Float[np.ndarray, " time"],
     *,
     threshold: float = 0.5,
     num_frames: int = 5,
     hidden_frames: int = 3,
 ) -> tuple[float, ...]:
-    """Seconds to lock anew, once for every time that the object shows again after `hidden_frames` or more.
+    """Seconds to lock again, one value for every reappearance of the object after `hidden_frames` or more.
 
-    Counts as `time_to_lock` from the first frame that shows it to the next such disappearance; infinite where it is not
-    locked before that, and left out where it shows too briefly to be.
+    Each is `time_to_lock` from the reappearance to the next disappearance of that length: infinite without a lock in
+    between, and left out where the object is visible for fewer than `num_frames` frames.
     """
-    shown = np.asarray(shown, bool)
-    edges = np.diff(np.concatenate([[0], shown.astype(np.int8), [0]]))
+    visible = np.asarray(visible, bool)
+    edges = np.diff(np.concatenate([[0], visible.astype(np.int8), [0]]))
     begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     long = begins[1:] - ends[:-1] >= hidden_frames
     starts = begins[1:][long]
     stops = [
-        int(ends[:-1][long][number + 1]) if number + 1 < len(starts) else len(shown) for number in range(len(starts))
+        int(ends[:-1][long][number + 1]) if number + 1 < len(starts) else len(visible) for number in range(len(starts))
     ]
-    found = []
+    times = []
     for start, stop in zip(starts, stops, strict=True):
         part = slice(int(start), stop)
-        if np.sum(shown[part]) >= num_frames:
-            found.append(time_to_lock(iou[part], shown[part], time_s[part], threshold=threshold, num_frames=num_frames))
-    return tuple(found)
+        if np.sum(visible[part]) >= num_frames:
+            times.append(
+                time_to_lock(iou[part], visible[part], time_s[part], threshold=threshold, num_frames=num_frames)
+            )
+    return tuple(times)
 
 
 def moved_for(
@@ -163,11 +165,11 @@ def moved_for(
     min_speed_m_s: float = 0.1,
     restarts: bool = False,
 ) -> Bool[np.ndarray, " time"]:
-    """Frames by which the tag has moved for `seconds` in total since the recording's start.
+    """Frames at which the tag has moved for `seconds` in total since the recording's start.
 
-    Speed is that of the true position, or of the true range where no position is known; frames where neither is known
-    add nothing, or with `restarts` set the clock back: an object that comes back has to be found anew. Without any such
-    truth every frame counts, if `seconds` is 0; else none does.
+    The speed is that of the true position, or of the true range where no position is known. Frames where neither is known
+    add nothing; with `restarts` they reset the total. Without any such truth every frame counts if `seconds` is 0, else
+    none does.
     """
     if seconds <= 0:
         return np.ones(len(time_s), dtype=bool)
@@ -190,7 +192,7 @@ def moved_for(
 
 @dataclasses.dataclass(frozen=True)
 class MaskedMean:
-    """A mean over valid elements as a state that can be merged; its result is NaN without any."""
+    """Mean over valid elements as a mergeable state; its result is NaN without any."""
 
     total: float = 0.0
     count: int = 0
@@ -219,51 +221,54 @@ class FrameScores:
     mask_j: Float[np.ndarray, " time"]
     identified: Int[np.ndarray, " time"]  # the label most covered by the mask, 0 = none
     confidence: Float[np.ndarray, " time"]
-    found: Bool[np.ndarray, " time"]  # the tracer claims an object
-    shown: Bool[np.ndarray, " time"]  # the truth shows the object whole
-    moved: Bool[np.ndarray, " time"]  # it has moved for long enough to be told apart
+    detected: Bool[np.ndarray, " time"]  # the tracer reports a detection
+    visible: Bool[np.ndarray, " time"]  # the whole object is visible in the truth
+    has_moved: Bool[np.ndarray, " time"]  # it has moved for the required time
     label: int
 
     @property
     def valid(self) -> Bool[np.ndarray, " time"]:
-        return self.shown & self.moved
+        return self.visible & self.has_moved
 
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """Summed scores of any number of tags. A frame without a claim counts as IoU 0 and as not identified; its centre
-    error is undefined and left out, so read `cle_px` together with `found`."""
+    """Accumulated scores of any number of tags.
+
+    A frame without a detection has IoU 0 and counts as not identified; its centre error is undefined and left out, so
+    read `cle_px` together with `detected`.
+    """
 
     means: Mapping[str, MaskedMean] = dataclasses.field(default_factory=dict)
-    lock_s: tuple[float, ...] = ()  # one element a tag that was shown
-    recover_s: tuple[float, ...] = ()  # one element a time that a tag's object showed again
+    lock_s: tuple[float, ...] = ()  # one element a tag with a visible object
+    recover_s: tuple[float, ...] = ()  # one element a reappearance of a tag's object
 
     @classmethod
     def of(cls, frames: FrameScores, *, threshold: float = 0.5, lock_frames: int = 5) -> Scores:
         """The state of one tag."""
-        valid, found = frames.valid, frames.found
-        iou = np.where(found, frames.iou, 0.0)
+        valid, detected = frames.valid, frames.detected
+        iou = np.where(detected, frames.iou, 0.0)
         columns = {
             "iou": iou,
-            "cle_px": np.where(found, frames.cle_px, np.nan),
-            "mask_j": np.where(found, frames.mask_j, 0.0),
-            "identification": (found & (frames.identified == frames.label)).astype(np.float64),
+            "cle_px": np.where(detected, frames.cle_px, np.nan),
+            "mask_j": np.where(detected, frames.mask_j, 0.0),
+            "identification": (detected & (frames.identified == frames.label)).astype(np.float64),
             "success": (iou >= threshold).astype(np.float64),
-            "found": found.astype(np.float64),
+            "detected": detected.astype(np.float64),
             "confidence": frames.confidence,
         }
         rule = {"threshold": threshold, "num_frames": lock_frames}
-        lock = time_to_lock(iou, frames.shown, frames.time_s, **rule)
+        lock = time_to_lock(iou, frames.visible, frames.time_s, **rule)
         return cls(
             {name: MaskedMean.of(values, valid) for name, values in columns.items()},
             () if np.isnan(lock) else (lock,),
-            times_to_recover(iou, frames.shown, frames.time_s, **rule),
+            times_to_recover(iou, frames.visible, frames.time_s, **rule),
         )
 
     @classmethod
-    def of_no_object(cls, found: Bool[np.ndarray, " time"]) -> Scores:
-        """The state of a tag that no labelled object carries: every claim of it is a false one."""
-        return cls({"false_claims": MaskedMean.of(found, np.ones_like(found))})
+    def of_unlabelled(cls, detected: Bool[np.ndarray, " time"]) -> Scores:
+        """The state of a tag whose object has no label: each of its detections is false."""
+        return cls({"false_detections": MaskedMean.of(detected, np.ones_like(detected))})
 
     def merge(self, other: Scores) -> Scores:
         names = {**self.means, **other.means}
@@ -274,17 +279,16 @@ class Scores:
         )
 
     def result(self) -> dict[str, float | int | None]:
-        """Named means, the count of frames they stand on, share of tags locked, median time to lock of those.
+        """Means by name, the number of frames, the fraction of tags locked and the median time to lock of those.
 
-        Where objects were hidden and showed again, also how often they were locked anew, and the median time to that.
-
+        Where objects reappear: also the fraction of reappearances that were locked again, and the median time to that.
         Undefined numbers are None, so that the result is plain JSON.
         """
         numbers: dict[str, float | int | None] = {}
         for name, mean in self.means.items():
             numbers[name] = mean.result() if mean.count else None
         locked = [lock for lock in self.lock_s if np.isfinite(lock)]
-        of_objects = (mean.count for name, mean in self.means.items() if name != "false_claims")
+        of_objects = (mean.count for name, mean in self.means.items() if name != "false_detections")
         numbers["num_frames"] = max(of_objects, default=0)
         numbers["num_tags"] = len(self.lock_s)
         numbers["locked"] = len(locked) / len(self.lock_s) if self.lock_s else None

@@ -73,7 +73,7 @@ class ReaderSettings:
 
     region: str = "china"
     num_tags: int = 1
-    flip_share: float = 0.05
+    flip_probability: float = 0.05
     multipath_rad: float = 0.1  # slow ripple of the phase along the path: the rail shows 0.13 to 0.23 rad
     dwell_s: float = DWELL_S
     dropout: float = 0.03  # share of the rounds in which a tag is not heard
@@ -83,8 +83,8 @@ class ReaderSettings:
             raise ValueError(f"Unknown region {self.region!r}; expected one of {', '.join(HOP_TABLES_HZ)}.")
         if self.num_tags < 1:
             raise ValueError(f"num_tags is {self.num_tags}; at least 1 tag must be there.")
-        if not 0 <= self.flip_share <= 0.5:
-            raise ValueError(f"flip_share is {self.flip_share}; expected a share between 0 and 0.5.")
+        if not 0 <= self.flip_probability <= 0.5:
+            raise ValueError(f"flip_probability is {self.flip_probability}; expected a share between 0 and 0.5.")
 
     @property
     def round_s(self) -> float:

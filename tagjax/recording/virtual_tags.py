@@ -122,7 +122,7 @@ def virtual_reads(
         + rng.uniform(0, 2 * np.pi)
         + ripple
         + rng.normal(size=count) * noise_sigma_rad(rssi, state.floor_rad)
-        + np.pi * (rng.random(count) < settings.flip_share)
+        + np.pi * (rng.random(count) < settings.flip_probability)
     )
     speed = np.gradient(range_m, time_s) if count > 1 else np.zeros(count)
     return TagReads(
@@ -137,7 +137,7 @@ def virtual_reads(
         ),
         channel_index=(index + 1).astype(np.int16),
         hop_table_hz=tuple(float(f) for f in state.hop_table_hz),
-        pi_flips=settings.flip_share > 0,
+        pi_flips=settings.flip_probability > 0,
     )
 
 

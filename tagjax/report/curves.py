@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 
 from .figure import blank
 
@@ -47,18 +47,4 @@ def score_curves(
     lower.set(ylabel="CLE (px of 512)", xlabel="frame number (shaded: not scored)")
     lower.set_ylim(bottom=0)
     upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=4)  # beside the title
-    figure.savefig(path, dpi=110)
-
-
-def training_curves(
-    path: Path, steps: Float[np.ndarray, " step"], terms: Mapping[str, Float[np.ndarray, " step"]]
-) -> None:
-    """Write a PNG with each term of the training objective against the step."""
-    figure = blank(8.0, 2.2 * max(len(terms), 1))
-    for axes, (name, values) in zip(
-        np.atleast_1d(figure.subplots(len(terms), 1, sharex=True)), terms.items(), strict=True
-    ):
-        axes.plot(steps, values, linewidth=1.2)
-        axes.set_ylabel(name)
-        axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

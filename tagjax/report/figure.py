@@ -1,4 +1,4 @@
-"""An empty figure that is written to a file, with no display behind it. Needs the viz extra."""
+"""Empty figures that are written to files without a display. Needs the viz extra."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 
 def blank(width: float, height: float) -> Figure:
-    """A figure of this size in inches, whose parts keep out of each other's way."""
+    """An empty figure of this size in inches, with constrained layout."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

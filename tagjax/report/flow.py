@@ -23,12 +23,12 @@ Tile = tuple[str, UInt8[np.ndarray, "_ _ 3"]]
 
 
 def colour_wheel() -> UInt8[np.ndarray, "55 3"]:
-    """The 55 hues of Baker et al. (IJCV 2011), by direction: finer where the eye tells more apart."""
+    """The 55 hues of Baker et al. (IJCV 2011), by direction, finer where the eye is more sensitive."""
     primaries = np.array([[255, 0, 0], [255, 255, 0], [0, 255, 0], [0, 255, 255], [0, 0, 255], [255, 0, 255]])
     arcs = []
     for start, end, steps in zip(primaries, np.roll(primaries, -1, axis=0), _ARCS, strict=True):
-        share = np.arange(steps)[:, None] / steps
-        arcs.append(np.floor((1 - share) * start + share * end))
+        weight = np.arange(steps)[:, None] / steps
+        arcs.append(np.floor((1 - weight) * start + weight * end))
     return np.concatenate(arcs).astype(np.uint8)
 
 
@@ -42,8 +42,8 @@ def flow_colours(
     wheel = colour_wheel().astype(np.float64) / 255
     place = (np.arctan2(-v, -u) / np.pi + 1) / 2 * (len(wheel) - 1)
     low = np.floor(place).astype(int)
-    share = (place - low)[..., None]
-    hue = (1 - share) * wheel[low] + share * wheel[(low + 1) % len(wheel)]
+    weight = (place - low)[..., None]
+    hue = (1 - weight) * wheel[low] + weight * wheel[(low + 1) % len(wheel)]
     colour = np.where(length <= 1, 1 - length * (1 - hue), 0.75 * hue)
     return np.where(known[..., None], np.floor(255 * colour), _UNKNOWN).astype(np.uint8)
 
@@ -87,8 +87,8 @@ def flow_panel(
     unit: str,
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Both pictures and the true flow, each flow in the same colours, and under it its error, all with their means."""
-    shown = list(flows_px.values()) if truth_px is None else [truth_px]
-    lengths = np.concatenate([np.linalg.norm(flow, axis=-1).ravel() for flow in shown])
+    drawn = list(flows_px.values()) if truth_px is None else [truth_px]
+    lengths = np.concatenate([np.linalg.norm(flow, axis=-1).ravel() for flow in drawn])
     largest_px = max(1.0, float(np.percentile(lengths[np.isfinite(lengths)], 99))) if lengths.size else 1.0
     top: list[Tile] = [("first", as_bytes(first)), ("second", as_bytes(second))]
     if truth_px is not None:

@@ -1,4 +1,4 @@
-"""Overlay pictures: what the tracer says drawn over the colour picture."""
+"""Overlay pictures: masks, boxes and confidences drawn over the colour picture."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ PALETTE_RGB = (
     (255, 130, 200),
     (170, 140, 90),
 )
-"""Colours of tags in their order, told apart on a dim room as well as on a bright one."""
+"""Colours of tags in their order, distinguishable on dark and on bright pictures."""
 
 _SIZE = 0.45
-"""Of letters, in OpenCV's measure."""
+"""Font scale, as OpenCV counts it."""
 
 _LINE = 14
-"""Pixels from one line of them to the next."""
+"""Line spacing of text, pixels."""
 
 MIN_WIDTH = 480
-"""Smaller pictures are enlarged by a whole factor, so that outlines and names stay readable."""
+"""Smaller pictures are enlarged by an integer factor, so that outlines and names stay readable."""
 
 
 def draw_overlay(
@@ -36,12 +36,12 @@ def draw_overlay(
     masks: Bool[np.ndarray, "tag height width"],
     boxes_px: Float[np.ndarray, "tag 4"],
     confidence: Float[np.ndarray, " tag"],
-    found: Bool[np.ndarray, " tag"],
+    detected: Bool[np.ndarray, " tag"],
     *,
     true_boxes_px: Shaped[np.ndarray, "tag 4"] | None = None,
     caption: str = "",
 ) -> UInt8[np.ndarray, "picture_height picture_width 3"]:
-    """RGB picture with each claimed object's tint, outline, box, name and confidence; true boxes thin and white."""
+    """RGB picture with the tint, outline, box, name and confidence of each detected object; true boxes thin and white."""
     scale = -(-MIN_WIDTH // colour.shape[1])
     picture = np.ascontiguousarray(colour.repeat(scale, axis=0).repeat(scale, axis=1))
     masks = masks.repeat(scale, axis=1).repeat(scale, axis=2)
@@ -53,7 +53,7 @@ def draw_overlay(
         if true_boxes_px is not None and np.all(np.isfinite(true_boxes_px[tag])):
             x0, y0, x1, y1 = np.round(true_boxes_px[tag]).astype(int).tolist()
             cv2.rectangle(picture, (x0, y0), (x1, y1), (255, 255, 255), 1)
-        if not found[tag] or not np.all(np.isfinite(boxes_px[tag])):
+        if not detected[tag] or not np.all(np.isfinite(boxes_px[tag])):
             continue
         mask = masks[tag]
         tinted = 0.65 * picture[mask].astype(np.float32) + 0.35 * np.array(shade, np.float32)
@@ -84,7 +84,7 @@ def _extent(text: str, place: tuple[int, int]) -> tuple[int, int, int, int]:
 def _free_place(
     text: str, box: tuple[int, int, int, int], taken: Sequence[tuple[int, int, int, int]], shape: tuple[int, ...]
 ) -> tuple[int, int]:
-    """Where a box's label covers no other: the nearest line above the box, else below, else inside."""
+    """A place for a box's label that covers no other label: the nearest line above the box, else below, else inside."""
     x0, y0, _, y1 = box
     left, _, right, _ = _extent(text, (0, 0))
     x = max(min(x0, shape[1] - (right - left) - 2), 2)
@@ -99,8 +99,7 @@ def _free_place(
 
 
 def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
-    # A dark rim under the letters keeps them readable on any background. Drawn shifted, not thicker: thicker letters
-    # are also wider.
+    # A dark outline keeps letters readable on any background. It is drawn by shifts: thicker letters are also wider.
     for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         _letters(picture, text, (place[0] + dx, place[1] + dy), (0, 0, 0))
     _letters(picture, text, place, shade)
@@ -111,5 +110,5 @@ def _letters(picture: np.ndarray, text: str, place: tuple[int, int], shade: tupl
 
 
 def short_name(epc: str, length: int = 6) -> str:
-    """An EPC short enough for a picture: its end, which is where EPCs of one batch differ."""
+    """A shortened EPC: its end, where EPCs of one batch differ."""
     return epc if len(epc) <= length else f"..{epc[-length:]}"

@@ -23,7 +23,7 @@ from .overlay import draw_overlay, short_name
 Results = Mapping[str, Sequence[RecordingResult]]
 """Results of each tracer, by name, one element a recording; the recordings are the same for all."""
 
-_COLUMNS = ("iou", "cle_px", "mask_j", "identified", "confidence", "found", "shown", "moved")
+_COLUMNS = ("iou", "cle_px", "mask_j", "identified", "confidence", "detected", "visible", "has_moved")
 
 
 def summarise(results: Results) -> dict[str, Any]:
@@ -41,14 +41,14 @@ def summarise(results: Results) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON beside and rename, so that a reader never sees half a file. NaN and infinity become null."""
+    """Write JSON atomically. NaN and infinity become null."""
     beside = path.with_name(path.name + ".part")
     beside.write_text(json.dumps(plain(content), indent=2) + "\n", encoding="utf-8")
     os.replace(beside, path)
 
 
 def plain(content: Any) -> Any:
-    """Numbers, strings, lists and dictionaries only; what is not finite becomes None."""
+    """Convert to numbers, strings, lists and dictionaries; numbers that are not finite become None."""
     if isinstance(content, Mapping):
         return {str(key): plain(value) for key, value in content.items()}
     if isinstance(content, (list, tuple)):
@@ -76,7 +76,7 @@ def write_report(folder: Path, results: Results) -> dict[str, Any]:
 
 
 def write_frames(path: Path, results: Results) -> None:
-    """One CSV row a tracer, recording, tag and frame."""
+    """One CSV row for each tracer, recording, tag and frame."""
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(("tracer", "recording", "epc", "label", "frame", "time_s", *_COLUMNS))
@@ -99,7 +99,7 @@ def write_frames(path: Path, results: Results) -> None:
 
 
 def write_overlays(folder: Path, result: RecordingResult) -> None:
-    """One PNG a kept frame, true boxes thin and white."""
+    """One PNG for each kept frame; true boxes are thin and white."""
     folder.mkdir(parents=True, exist_ok=True)
     truth = result.recording.truth
     for picture in result.pictures:
@@ -115,7 +115,7 @@ def write_overlays(folder: Path, result: RecordingResult) -> None:
             picture.masks,
             picture.boxes_px,
             picture.confidence,
-            picture.found,
+            picture.detected,
             true_boxes_px=true_boxes,
             caption=f"frame {picture.frame}",
         )
@@ -123,11 +123,14 @@ def write_overlays(folder: Path, result: RecordingResult) -> None:
 
 
 def write_curves(folder: Path, results: Results) -> None:
-    """One PNG a tag: IoU and CLE against frame number, all tracers together."""
+    """One PNG for each tag: IoU and CLE against frame number, all tracers together."""
     try:
         from .curves import score_curves
     except ImportError:
-        warnings.warn("No curves: matplotlib is missing (it comes with the viz extra).", stacklevel=2)
+        warnings.warn(
+            "No curves were drawn: matplotlib is not installed. Install the viz extra: pip install 'tagjax[viz]'.",
+            stacklevel=2,
+        )
         return
     folder.mkdir(parents=True, exist_ok=True)
     reference = next(iter(results.values()), ())
@@ -137,8 +140,8 @@ def write_curves(folder: Path, results: Results) -> None:
             for tracer, ones in results.items():
                 own = ones[number].frames[epc]
                 lines[tracer] = {
-                    "iou": np.where(own.found, own.iou, 0.0),
-                    "cle_px": np.where(own.found & own.shown, own.cle_px, np.nan),
+                    "iou": np.where(own.detected, own.iou, 0.0),
+                    "cle_px": np.where(own.detected & own.visible, own.cle_px, np.nan),
                 }
             name = _recording_name(reference, number)
             offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
@@ -151,14 +154,14 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
         "iou": "IoU",
         "cle_px": "CLE px",
         "mask_j": "J",
-        "identification": "named",
-        "found": "found",
+        "identification": "identified",
+        "detected": "detected",
         "locked": "locked",
         "time_to_lock_s": "lock s",
         "num_frames": "frames",
     }
-    if any(scores["all"].get("false_claims") is not None for scores in summary.values()):
-        columns["false_claims"] = "false"
+    if any(scores["all"].get("false_detections") is not None for scores in summary.values()):
+        columns["false_detections"] = "false det."
     rows = [[_cell(scores["all"].get(name)) for name in columns] for scores in summary.values()]
     table = Table(title=title, box=SIMPLE, pad_edge=False, collapse_padding=True)
     table.add_column("tracer", no_wrap=True)
@@ -170,7 +173,7 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
 
 
 def _cell(value: float | int | None) -> str:
-    """Three digits; of what is below one, three places, so that columns stay narrow."""
+    """Three significant digits; three decimal places below 1, so that columns stay narrow."""
     if value is None:
         return "-"
     if isinstance(value, int):

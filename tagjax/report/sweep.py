@@ -11,8 +11,8 @@ from jaxtyping import Float
 from .figure import blank
 
 
-def worded(value: int | float | str | bool) -> str:
-    """A parameter's value as it is shown."""
+def value_text(value: int | float | str | bool) -> str:
+    """A parameter's value as text."""
     return str(value) if isinstance(value, str | bool) else f"{value:.6g}"
 
 
@@ -35,14 +35,14 @@ def curve_panels(path: Path, curves: Mapping[str, Mapping[str, Float[np.ndarray,
 
 
 def parameter_panels(path: Path, best: Mapping[str, Mapping[int | float | str | bool, float]]) -> None:
-    """Write a PNG with a panel for each parameter: the best mean box IoU that each of its values allows."""
+    """Write a PNG with a panel for each parameter: the best mean box IoU over all points with each of its values."""
     figure = blank(3.6 * len(best), 3.2)
     panels = figure.subplots(1, len(best), sharey=True, squeeze=False)[0]
     for axes, (name, values) in zip(panels, best.items(), strict=True):
         words = any(isinstance(value, str) for value in values)
         at = sorted(values, key=str if words else None)
         axes.plot(range(len(at)), [values[value] for value in at], "o-", linewidth=1.4)
-        axes.set_xticks(range(len(at)), [worded(value) for value in at])
+        axes.set_xticks(range(len(at)), [value_text(value) for value in at])
         axes.set(xlabel=name)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("best mean box IoU")

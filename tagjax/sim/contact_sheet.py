@@ -1,4 +1,4 @@
-"""Contact sheets: a row of frames for each recording, true outlines drawn in, so that a suite is seen at a glance."""
+"""Contact sheets of suites: a row of frames for each recording, with the true outlines of labelled objects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ..recording import Recording, RecordingError
 from ..recording.store import open_recording
-from .planar import PlanarTrials, open_planar
+from .radio.planar import PlanarTrials, open_planar
 from .suites import PLANAR, Item, Suite, make_suite
 
 _EDGE = 2
@@ -25,9 +25,11 @@ _TITLE = 18
 def contact_sheet(
     recordings: Sequence[Recording], titles: Sequence[str], *, num_frames: int = 6, width: int = 192
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """One row a recording, `num_frames` frames spread over it, each scaled to `width` pixels, under its title."""
+    """One row per recording under its title: `num_frames` evenly spaced frames, each scaled to `width` pixels."""
     if not recordings or len(recordings) != len(titles):
-        raise ValueError(f"{len(recordings)} recordings and {len(titles)} titles; a sheet needs one title for each.")
+        raise ValueError(
+            f"{len(recordings)} recordings and {len(titles)} titles; expected one title for each of at least one recording."
+        )
     rows = []
     for recording, title in zip(recordings, titles, strict=True):
         frames = np.linspace(0, recording.num_frames - 1, num_frames).round().astype(int)
@@ -76,13 +78,15 @@ def planar_sheet(trials: PlanarTrials) -> UInt8[np.ndarray, "rows columns 3"]:
 
 
 def save_sheet(suite: Suite, folder: Path) -> Path:
-    """The sheet of a suite made in `folder`: the first recording there is of each variant, as contact_sheet.png."""
+    """Write the contact sheet of a suite made in `folder`: the first recording of each variant, as contact_sheet.png."""
     first: dict[str, Item] = {}
     for item in reversed(suite.items()):
         if item.path(folder).exists():
             first[item.variant.name] = item
     if not first:
-        raise RecordingError(f"{folder / suite.name} holds no recording yet; make the suite first.")
+        raise RecordingError(
+            f"{folder / suite.name} holds no recording; expected at least one. Simulate the suite first."
+        )
     chosen = [first[variant.name] for variant in suite.variants if variant.name in first]
     if suite.story == PLANAR:
         sheet = planar_sheet(open_planar(chosen[0].path(folder)))
@@ -94,14 +98,14 @@ def save_sheet(suite: Suite, folder: Path) -> Path:
     return path
 
 
-def save_glance(suite: Suite, folder: Path, *, workers: int = 1, width: int = 960) -> Path:
-    """The sheet of a suite as <folder>/<name>.jpg, at most `width` pixels wide, without its recordings.
+def save_preview(suite: Suite, folder: Path, *, workers: int = 1, width: int = 960) -> Path:
+    """Write a suite's contact sheet as <folder>/<name>.jpg, at most `width` pixels wide, without its recordings.
 
-    Six frames of the first recording of every variant are simulated for it, and not kept.
+    Six frames of the first recording of every variant are simulated for it and not kept.
     """
     with tempfile.TemporaryDirectory() as scratch:
-        make_suite(suite.glance(), Path(scratch), workers=workers)
-        sheet = cv2.imread(str(save_sheet(suite.glance(), Path(scratch))))
+        make_suite(suite.preview(), Path(scratch), workers=workers)
+        sheet = cv2.imread(str(save_sheet(suite.preview(), Path(scratch))))
     assert sheet is not None
     shrink = min(1.0, width / sheet.shape[1])
     sheet = cv2.resize(sheet, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)

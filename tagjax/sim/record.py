@@ -1,57 +1,59 @@
-"""From a simulated world to a `Recording`: pictures, depth, reads, and every truth from the same rays."""
+"""Simulate a scenario: a `Recording` with pictures, depth, reads and the complete ground truth.
+
+Ray casting, and with it MuJoCo (the `sim` extra), is imported when the first recording is simulated.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from ..recording import ClockAudit, Intrinsics, Recording, TagReads, Truth
 from ..recording.importers.clock import audit_clocks, to_host_ns
 from ..recording.virtual_tags import Track
-from .channel import Environment, Planes, Scatterers
-from .flow_truth import flow_between
-from .inventory import InventorySettings, simulate_inventory
-from .raycast import Hits, Stage, look_at
-from .rooms import Panel
-from .sensors import SENSORS, frame_times, kinect_v2_intrinsics, xtion_intrinsics
-from .session import mask_boxes
-from .shading import ILLUMINATION, Shader, auto_exposure
-from .visibility import steps_every
-from .world import STEP_S, World, tag_dipole, tag_path
+from .radio.environment import room_environment
+from .radio.inventory import simulate_inventory
+from .rendering.exact_flow import flow_between
+from .rendering.exposure import ILLUMINATION, auto_exposure
+from .rendering.hits import Hits
+from .rendering.sensors import SENSORS, frame_times, kinect_v2_intrinsics, xtion_intrinsics
+from .rendering.viewpoint import Viewpoint, look_at
+from .rendering.visibility import sampled_steps
+from .stories.scenario import Scenario
+from .world.bodies import STEP_S, World, tag_dipole, tag_path
+from .world.sightline import line_of_sight
 
-PERSON_RCS_M2 = 1.0
-"""Radar cross section of a standing person at 900 MHz: the upper end of what was measured (see `Scatterers`)."""
-
-_SIGHT_EVERY_S = 0.05
-"""Between looks at lines of sight and at where people are; a walker moves by 7 cm in it."""
+_SIGHT_PERIOD_S = 0.05
+"""Sampling period of lines of sight and of people's positions for the radio; a walker moves by 7 cm in it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSettings:
-    """The camera and what it makes of the scene; `width` None is the sensor's own."""
+    """The simulated camera. `width` None is the sensor's native width."""
 
     sensor: str = "kinect_v2"
     width: int | None = None
     frame_rate_hz: float = 30.0
     illumination: str = "bright"
-    jitter_s: float = 0.002
-    drop_share: float = 0.0
-    shutter_s: float = 0.0  # motion blur; 0 = none
+    jitter_s: float = 0.002  # standard deviation of frame times
+    drop_probability: float = 0.0  # of a frame
+    shutter_s: float = 0.0  # exposure time that causes motion blur; 0 = none
     shadows: bool = True
-    flow: bool = False  # exact flow and occlusion, both ways, in the truth
+    flow: bool = False  # exact forward and backward flow with occlusion in the truth
 
     def __post_init__(self):
         if self.sensor not in SENSORS:
-            raise ValueError(f"Unknown sensor {self.sensor!r}; known are {', '.join(SENSORS)}.")
+            raise ValueError(f"sensor is {self.sensor!r}; expected one of {', '.join(SENSORS)}.")
         if self.illumination not in ILLUMINATION:
-            raise ValueError(f"Unknown illumination {self.illumination!r}; known are {', '.join(ILLUMINATION)}.")
+            raise ValueError(f"illumination is {self.illumination!r}; expected one of {', '.join(ILLUMINATION)}.")
         if self.width is not None and self.width < 16:
-            raise ValueError(f"width is {self.width}; a picture of at least 16 pixels is needed.")
+            raise ValueError(f"width is {self.width}; expected at least 16 pixels.")
         if self.frame_rate_hz <= 0 or self.shutter_s < 0:
             raise ValueError(
-                f"frame_rate_hz {self.frame_rate_hz}, shutter_s {self.shutter_s}; expected positive, and not negative."
+                f"frame_rate_hz is {self.frame_rate_hz} and shutter_s {self.shutter_s}; expected a positive rate and a "
+                "shutter time of at least 0."
             )
 
     def intrinsics(self) -> Intrinsics:
@@ -60,41 +62,8 @@ class CaptureSettings:
         return camera() if self.width is None else camera(self.width)
 
 
-@dataclasses.dataclass(frozen=True)
-class Filmed:
-    """A world, and how it is filmed and read: all that a recording is made of. Places in the world frame."""
-
-    world: World
-    camera_position_m: tuple[float, float, float]
-    camera_look_at_m: tuple[float, float, float]
-    antennas_m: tuple[tuple[float, float, float], ...]
-    panels: tuple[Panel, ...] = ()
-    inventory: InventorySettings = dataclasses.field(default_factory=InventorySettings)
-    antenna_axes: tuple[tuple[float, float, float], ...] | None = None  # unit; at camera_look_at_m if None
-
-
-def room_environment(panels: Sequence[Panel], num_people: int) -> Environment:
-    """The room's reflectors, and a cylinder for each person (placed by the path given with it)."""
-    rows = [(p.centre_m, p.normal, p.along, p.half_size_m, p.reflection) for p in panels]
-    centre, normal, along, half, reflection = zip(*rows, strict=True) if rows else ((), (), (), (), ())
-    shape = (len(rows), 3)
-    planes = Planes(
-        np.reshape(centre, shape), np.reshape(normal, shape), np.reshape(along, shape),
-        np.reshape(half, (len(rows), 2)), np.asarray(reflection, float),
-    )  # fmt: skip
-    people = Scatterers(
-        np.zeros((num_people, 3)),
-        np.full(num_people, PERSON_RCS_M2),
-        np.full(num_people, -0.6),
-        np.broadcast_to([0.0, 0.0, 1.0], (num_people, 3)),
-        np.full(num_people, 0.5),
-        np.full(num_people, 0.16),
-    )
-    return Environment(planes, people)
-
-
-def film(
-    filmed: Filmed,
+def simulate_recording(
+    scenario: Scenario,
     capture: CaptureSettings | None = None,
     *,
     seed: int,
@@ -102,29 +71,72 @@ def film(
     num_frames: int | None = None,
     on_frame: Callable[[], None] | None = None,
 ) -> Recording:
-    """Render, sense and read a world; the same arguments give the same recording, byte for byte on one machine.
+    """Render the pictures of a scenario and read its tags. The same arguments give the same bytes on one machine.
 
-    `num_frames` None films to the end of the world. Raises `ValueError` where the world is shorter than asked.
+    `num_frames` None renders to the end of the world. Raises `ValueError` where the world is shorter than `num_frames`.
     """
     capture = capture or CaptureSettings()
-    world = filmed.world
+    world = scenario.world
     rng = np.random.default_rng([seed, 2])
-    most = int((world.num_steps - 1) * STEP_S * capture.frame_rate_hz * (1 - capture.drop_share)) + 1
-    wanted = most if num_frames is None else num_frames
-    if wanted < 1 or wanted > most:
-        raise ValueError(f"{name}: {wanted} frames asked for; the world lasts for {most}.")
-    stamps = frame_times(wanted, capture.frame_rate_hz, rng, jitter_s=capture.jitter_s, drop_share=capture.drop_share)
-    steps = np.minimum(stamps / STEP_S, world.num_steps - 1)
-    stage = Stage(world)
-    view = look_at(capture.intrinsics(), filmed.camera_position_m, filmed.camera_look_at_m)
-    shader, sensor, lamp = Shader(stage), SENSORS[capture.sensor], ILLUMINATION[capture.illumination]
-    frames: dict[str, list[np.ndarray]] = {key: [] for key in ("colour", "depth", "labels")}
-    flows: dict[str, list[np.ndarray]] = {key: [] for key in ("ahead", "ahead_hidden", "back", "back_hidden")}
+    longest = int((world.num_steps - 1) * STEP_S * capture.frame_rate_hz * (1 - capture.drop_probability)) + 1
+    wanted = longest if num_frames is None else num_frames
+    if not 1 <= wanted <= longest:
+        raise ValueError(f"{name}: num_frames is {wanted}; expected 1 to {longest}, the length of the world.")
+    times = frame_times(
+        wanted, capture.frame_rate_hz, rng, jitter_s=capture.jitter_s, drop_probability=capture.drop_probability
+    )
+    steps = np.minimum(times / STEP_S, world.num_steps - 1)
+    view = look_at(capture.intrinsics(), scenario.camera_position_m, scenario.camera_look_at_m)
+    frames, flow = _render(world, view, capture, steps, rng, on_frame)
+    reads, clock, sight = _read_tags(scenario, seed)
+    antennas = view.to_camera(np.asarray(scenario.antennas_m, float))
+    position = {tag.epc: _at_steps(view.to_camera(tag_path(world, tag)), steps) for tag in world.tags}
+    labels = frames["labels"]
+    num_labels = max((body.label for body in world.bodies), default=0)
+    return Recording(
+        colour=frames["colour"],
+        depth=frames["depth"],
+        time_ns=np.rint(times * 1e9).astype(np.int64),
+        intrinsics=view.intrinsics,
+        reads=reads,
+        antennas_m=antennas,
+        clock=clock,
+        truth=Truth(
+            labels=labels,
+            tag_to_label={tag.epc: world.bodies[tag.body].label for tag in world.tags if world.bodies[tag.body].label},
+            boxes_px=mask_boxes(labels, num_labels),
+            tag_range_m={epc: np.linalg.norm(path - antennas[0], axis=1) for epc, path in position.items()},
+            tag_position_m=position,
+            visible={label: np.any(labels == label, axis=(1, 2)) for label in range(1, num_labels + 1)},
+            line_of_sight={epc: _at_steps(kept[:, None], steps)[:, 0] for epc, kept in sight.items()},
+            **flow,
+        ),
+        name=name,
+        source=f"simulated: {world.note or name}, seed {seed}, {capture}",
+    )
+
+
+def _render(
+    world: World,
+    view: Viewpoint,
+    capture: CaptureSettings,
+    steps: np.ndarray,
+    rng: np.random.Generator,
+    on_frame: Callable[[], None] | None,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Colour, depth and labels of every frame, and the fields of `Truth` that hold exact flow (none unless asked for)."""
+    from .rendering.raycast import Raycaster
+    from .rendering.shading import Shader
+
+    raycaster = Raycaster(world)
+    shader, sensor, lamp = Shader(raycaster), SENSORS[capture.sensor], ILLUMINATION[capture.illumination]
+    frames: dict[str, list[np.ndarray]] = {"colour": [], "depth": [], "labels": []}
+    flows = []
     previous: Hits | None = None
     exposure = 0.0
     for step in steps:
-        stage.pose(step)
-        hits = stage.cast(view)
+        raycaster.pose(step)
+        hits = raycaster.cast(view)
         surface = shader.surface(hits)
         light = (
             shader.blurred(view, step, capture.shutter_s / STEP_S, shadows=capture.shadows)
@@ -134,53 +146,35 @@ def film(
         exposure = exposure or auto_exposure(light)
         frames["colour"].append(lamp.expose(light, rng, exposure=exposure))
         frames["depth"].append(sensor.measure(hits, surface.reflectance, surface.shine, rng))
-        frames["labels"].append(stage.labels(hits))
+        frames["labels"].append(raycaster.labels(hits))
         if capture.flow and previous is not None:
-            truth = flow_between(previous, hits)
-            flows["ahead"].append(truth.forward_px)
-            flows["ahead_hidden"].append(truth.forward_occluded)
-            flows["back"].append(truth.backward_px)
-            flows["back_hidden"].append(truth.backward_occluded)
+            flows.append(flow_between(previous, hits))
         previous = hits
         if on_frame is not None:
             on_frame()
-    reads, clock, sight = _read_tags(filmed, stage, seed)
-    in_camera = {tag.epc: view.to_camera(tag_path(world, tag)) for tag in world.tags}
-    antennas = view.to_camera(np.asarray(filmed.antennas_m, float))
-    place = {epc: _at_steps(path, steps) for epc, path in in_camera.items()}
-    labels = np.stack(frames["labels"])
-    height, width = view.intrinsics.height, view.intrinsics.width
-    missing, nothing = np.full((height, width, 2), np.nan, np.float32), np.zeros((height, width), bool)
-    flow = {}
-    if capture.flow:
-        flow = {
-            "flow_px": np.stack([*flows["ahead"], missing]),
-            "occluded": np.stack([*flows["ahead_hidden"], nothing]),
-            "backward_flow_px": np.stack([missing, *flows["back"]]),
-            "backward_occluded": np.stack([nothing, *flows["back_hidden"]]),
-        }
-    most_label = max((body.label for body in world.bodies), default=0)
-    return Recording(
-        colour=np.stack(frames["colour"]),
-        depth=np.stack(frames["depth"]),
-        time_ns=np.rint(stamps * 1e9).astype(np.int64),
-        intrinsics=view.intrinsics,
-        reads=reads,
-        antennas_m=antennas,
-        clock=clock,
-        truth=Truth(
-            labels=labels,
-            tag_to_label={tag.epc: world.bodies[tag.body].label for tag in world.tags if world.bodies[tag.body].label},
-            boxes_px=mask_boxes(labels, most_label),
-            tag_range_m={epc: np.linalg.norm(path - antennas[0], axis=1) for epc, path in place.items()},
-            tag_position_m=place,
-            visible={label: np.any(labels == label, axis=(1, 2)) for label in range(1, most_label + 1)},
-            line_of_sight={epc: _at_steps(share[:, None], steps)[:, 0] for epc, share in sight.items()},
-            **flow,
-        ),
-        name=name,
-        source=f"simulated: {world.note or name}, seed {seed}, {capture}",
-    )
+    pictures = {key: np.stack(values) for key, values in frames.items()}
+    if not capture.flow:
+        return pictures, {}
+    # There is no flow from the last frame on, nor back from the first.
+    shape = (view.intrinsics.height, view.intrinsics.width)
+    missing, nothing = np.full((*shape, 2), np.nan, np.float32), np.zeros(shape, bool)
+    return pictures, {
+        "flow_px": np.stack([*(flow.forward_px for flow in flows), missing]),
+        "occluded": np.stack([*(flow.forward_occluded for flow in flows), nothing]),
+        "backward_flow_px": np.stack([missing, *(flow.backward_px for flow in flows)]),
+        "backward_occluded": np.stack([nothing, *(flow.backward_occluded for flow in flows)]),
+    }
+
+
+def mask_boxes(labels: np.ndarray, num_labels: int) -> np.ndarray:
+    """Boxes x0 y0 x1 y1 (inclusive) of labels 1 .. num_labels, float32 (frames, labels, 4), NaN where not visible."""
+    out = np.full((len(labels), num_labels, 4), np.nan, np.float32)
+    for t, frame in enumerate(labels):
+        for label in range(1, num_labels + 1):
+            rows, columns = np.nonzero(frame == label)
+            if rows.size:
+                out[t, label - 1] = columns.min(), rows.min(), columns.max(), rows.max()
+    return out
 
 
 def _at_steps(path: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -189,52 +183,55 @@ def _at_steps(path: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(steps, index, column) for column in path.T], axis=-1)
 
 
-def _read_tags(filmed: Filmed, stage: Stage, seed: int) -> tuple[TagReads, ClockAudit | None, dict[str, np.ndarray]]:
-    """The reads, on the host's clock; and each tag's share of the first antenna's field that its line of sight keeps."""
-    world = filmed.world
+def _read_tags(scenario: Scenario, seed: int) -> tuple[TagReads, ClockAudit | None, dict[str, np.ndarray]]:
+    """The reads on the host's clock, and for each tag the field ratio that its line of sight to the first antenna keeps.
+
+    The ratio is (num_steps,): 1 for a free line of sight, 0 behind metal.
+    """
+    world = scenario.world
     if not world.tags:
         return TagReads.empty(), None, {}
-    antennas = np.asarray(filmed.antennas_m, float)
+    antennas = np.asarray(scenario.antennas_m, float)
     time_s = np.arange(world.num_steps) * STEP_S
-    checked = steps_every(world, _SIGHT_EVERY_S)
+    sampled = sampled_steps(world, _SIGHT_PERIOD_S)
     paths, transmission, dipole = {}, {}, {}
     for tag in world.tags:
         path = tag_path(world, tag)
         kept = []
         for antenna in antennas:
-            start = np.broadcast_to(antenna, (len(checked), 3))
-            sight = stage.line_of_sight(start, path[checked], steps=checked, exclude=(tag.body,))
-            kept.append(np.interp(np.arange(world.num_steps), checked, 10.0 ** (-sight.loss_db / 20)))
+            start = np.broadcast_to(antenna, (len(sampled), 3))
+            sight = line_of_sight(world, start, path[sampled], sampled, exclude=(tag.body,))
+            kept.append(np.interp(np.arange(world.num_steps), sampled, 10.0 ** (-sight.loss_db / 20)))
         paths[tag.epc] = Track(time_s, path)
         transmission[tag.epc] = np.stack(kept, axis=-1)
         dipole[tag.epc] = tag_dipole(world, tag)
     people = _people(world)
-    moving = (time_s[checked], np.stack([path[checked] for path in people], axis=1)) if people else None
-    boresight = np.asarray(filmed.camera_look_at_m, float) - antennas
-    if filmed.antenna_axes is not None:
-        boresight = np.asarray(filmed.antenna_axes, float)
-    done = simulate_inventory(
+    scatterer_path = (time_s[sampled], np.stack([path[sampled] for path in people], axis=1)) if people else None
+    boresight = np.asarray(scenario.camera_look_at_m, float) - antennas
+    if scenario.antenna_axes is not None:
+        boresight = np.asarray(scenario.antenna_axes, float)
+    inventory = simulate_inventory(
         paths,
         antennas,
-        room_environment(filmed.panels, len(people)),
-        filmed.inventory,
+        room_environment(scenario.panels, len(people)),
+        scenario.inventory,
         seed=seed,
         transmission=transmission,
         dipole=dipole,
         boresight=boresight / np.linalg.norm(boresight, axis=1, keepdims=True),
-        scatterer_path=moving,
+        scatterer_path=scatterer_path,
     )
-    sight = {epc: share[:, 0] for epc, share in transmission.items()}
-    reads = done.reads
+    sight = {epc: ratio[:, 0] for epc, ratio in transmission.items()}
+    reads = inventory.reads
     if reads.reader_time_ns is None or reads.num_reads < 2:
         return reads, None, sight
-    # As the importers do: what the reader's clock says, on the host's.
+    # As importers do: times of the reader's clock, converted to the host's clock.
     audit = audit_clocks(reads.reader_time_ns, reads.time_ns)
     return dataclasses.replace(reads, time_ns=to_host_ns(reads.reader_time_ns, audit)), audit, sight
 
 
 def _people(world: World) -> list[np.ndarray]:
-    """The middle of every person at every step: the mean of all limbs."""
+    """The centre of every person at every step, (num_steps, 3): the mean over the limbs."""
     limbs: dict[str, list[np.ndarray]] = {}
     for body in world.bodies:
         if body.role == "person":

@@ -1,15 +1,17 @@
-"""Benchmark suites: which stories are told how often, for training, validation and test, and made on many cores."""
+"""Suites: named sets of simulated recordings with train, validation and test splits, made in several processes."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
 import itertools
 import json
 import multiprocessing
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -18,15 +20,16 @@ import numpy as np
 
 from ..recording import RecordingError
 from ..recording.store import save_recording
-from .inventory import InventorySettings
-from .planar import PlanarSettings, planar_trials, save_planar
-from .record import CaptureSettings, Filmed, film
-from .stories import STORIES, tell
+from .radio.inventory import InventorySettings
+from .radio.planar import PlanarSettings, planar_trials, save_planar
+from .record import CaptureSettings, simulate_recording
+from .stories import STORIES, build_scenario
+from .stories.scenario import Scenario
 
 SPLITS = ("train", "validation", "test")
 
 PLANAR = "planar_101"
-"""The one story that has no picture."""
+"""The only story without pictures."""
 
 MANIFEST = "suite.json"
 
@@ -36,7 +39,7 @@ _DRAWS = 6
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One condition of a suite: its name, and what differs from the suite's settings."""
+    """One condition of a suite: its name, and the settings that differ from the suite's."""
 
     name: str
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -47,7 +50,7 @@ class Variant:
 
 @dataclasses.dataclass(frozen=True)
 class Counts:
-    """Recordings of each variant in each split."""
+    """Number of recordings of each variant in each split."""
 
     train: int = 2
     validation: int = 1
@@ -56,7 +59,7 @@ class Counts:
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """A named experiment: everything that its recordings follow from."""
+    """A named set of recordings. These settings determine every recording."""
 
     name: str
     about: str
@@ -64,54 +67,60 @@ class Suite:
     story: str
     seed: int
     duration_s: float = 5.0
-    smoke_s: float = 2.4  # of the suite in small: less where the story is told in less, more where it needs it
+    smoke_s: float = 2.4  # duration of the recordings in small
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     capture: CaptureSettings = dataclasses.field(default_factory=CaptureSettings)
-    reader: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # what differs from the story's inventory
+    reader: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # settings that differ from the story's `InventorySettings`
     variants: tuple[Variant, ...] = (Variant("all"),)
     counts: Counts = dataclasses.field(default_factory=Counts)
 
     def __post_init__(self):
         for story in (self.story, *(variant.story for variant in self.variants if variant.story is not None)):
             if story not in (PLANAR, *STORIES):
-                raise ValueError(f"{self.name}: unknown story {story!r}; known are {', '.join([*STORIES, PLANAR])}.")
+                raise ValueError(f"{self.name}: story is {story!r}; expected one of {', '.join([*STORIES, PLANAR])}.")
         if not (self.duration_s > 0 and self.smoke_s > 0):
             raise ValueError(
-                f"{self.name}: duration_s is {self.duration_s}, smoke_s {self.smoke_s}; positive ones are needed."
+                f"{self.name}: duration_s is {self.duration_s}, smoke_s {self.smoke_s}; expected positive durations."
             )
         known = {field.name for field in dataclasses.fields(InventorySettings)}
         for reader in (self.reader, *(variant.reader for variant in self.variants)):
             if unknown := sorted(set(reader) - known):
                 raise ValueError(
-                    f"{self.name}: unknown reader setting {', '.join(unknown)}; known are {', '.join(sorted(known))}."
+                    f"{self.name}: unknown reader setting {', '.join(unknown)}; expected settings among "
+                    f"{', '.join(sorted(known))}."
                 )
         if min(dataclasses.astuple(self.counts)) < 0 or not self.variants:
-            raise ValueError(f"{self.name}: counts {self.counts}, {len(self.variants)} variants; expected some.")
+            raise ValueError(
+                f"{self.name}: {self.counts} and {len(self.variants)} variants; expected counts of at least 0 and at least "
+                "1 variant."
+            )
         names = [variant.name for variant in self.variants]
         if len(set(names)) != len(names):
-            raise ValueError(f"{self.name}: variants share a name: {', '.join(names)}.")
+            raise ValueError(f"{self.name}: variants are named {', '.join(names)}; expected different names.")
 
     def smoke(self) -> Suite:
-        """The suite in small, for tests: pictures 64 pixels wide, `smoke_s` long, one test recording a variant."""
+        """The suite in small, for tests: pictures 64 pixels wide, `smoke_s` long, one test recording per variant."""
         capture = dataclasses.replace(self.capture, width=64, frame_rate_hz=min(self.capture.frame_rate_hz, 5.0))
         return dataclasses.replace(
             self, duration_s=min(self.duration_s, self.smoke_s), capture=capture, counts=Counts(0, 0, 1)
         )
 
-    def glance(self, num_frames: int = 6) -> Suite:
-        """A few frames of the first recording of every variant (of test, or else of training), for a contact sheet.
+    def preview(self, num_frames: int = 6) -> Suite:
+        """A few frames of the first test recording of every variant (or training recording), for a contact sheet.
 
         The worlds are those of the suite itself.
         """
         rate_hz = (num_frames - 0.9) / self.duration_s
         width = min(self.capture.width or 384, 384)
-        capture = dataclasses.replace(self.capture, width=width, frame_rate_hz=rate_hz, drop_share=0.0)
+        capture = dataclasses.replace(self.capture, width=width, frame_rate_hz=rate_hz, drop_probability=0.0)
         return dataclasses.replace(
             self, capture=capture, counts=Counts(0, 0, 1) if self.counts.test else Counts(1, 0, 0)
         )
 
     def items(self) -> list[Item]:
-        """Every recording of the suite."""
+        """All recordings of the suite."""
         found = []
         for split, (index, variant) in itertools.product(range(len(SPLITS)), enumerate(self.variants)):
             for number in range(dataclasses.astuple(self.counts)[split]):
@@ -136,44 +145,44 @@ class Item:
         return f"{self.suite.name}-{self.variant.name}-{self.split}-{self.number}"
 
     def path(self, folder: Path) -> Path:
-        """Where it lies within the output folder."""
+        """Path of the recording within the output folder."""
         return folder / self.suite.name / self.split / f"{self.name}.zarr"
 
 
 @dataclasses.dataclass(frozen=True)
 class Made:
-    """What making one recording took."""
+    """A simulated recording: its name, length, and the time that the simulation took."""
 
     name: str
     num_frames: int
     elapsed_s: float
 
 
-def stage_item(item: Item) -> Filmed:
-    """The world of a recording: the first of a few draws in which everything finds its place.
+def item_scenario(item: Item) -> Scenario:
+    """The scenario of a recording: the first of several draws that satisfies all constraints of the story.
 
-    Raises `ValueError` with the last draw's reason if none does.
+    Raises `ValueError` with the reason of the last draw if none does.
     """
     suite, variant = item.suite, item.variant
     settings, reader = {**suite.settings, **variant.settings}, {**suite.reader, **variant.reader}
     for draw in range(_DRAWS):
         try:
             rng = np.random.default_rng([item.seed, draw])
-            filmed = tell(variant.story or suite.story, rng, suite.duration_s, settings)
-            filmed.world.check()
-            filmed = dataclasses.replace(filmed, inventory=dataclasses.replace(filmed.inventory, **reader))
+            scenario = build_scenario(variant.story or suite.story, rng, suite.duration_s, settings)
+            scenario.world.check()
+            scenario = dataclasses.replace(scenario, inventory=dataclasses.replace(scenario.inventory, **reader))
         except ValueError as error:
             if draw == _DRAWS - 1:
                 raise ValueError(
-                    f"{item.name} (seed {item.seed}), {_DRAWS} draws in vain; the last: {error}"
+                    f"{item.name} (seed {item.seed}): all {_DRAWS} draws failed; the last one: {error}"
                 ) from error
         else:
-            return filmed
+            return scenario
     raise AssertionError("a draw returns or raises")
 
 
 def make_item(item: Item, folder: Path) -> Made:
-    """Simulate one recording and write it; it appears whole or not at all."""
+    """Simulate one recording and write it. It appears complete or not at all."""
     start = time.perf_counter()
     path = item.path(folder)
     if item.suite.story == PLANAR:
@@ -185,16 +194,16 @@ def make_item(item: Item, folder: Path) -> Made:
         os.replace(partial, path)
         return Made(item.name, 0, time.perf_counter() - start)
     capture = dataclasses.replace(item.suite.capture, **item.variant.capture)
-    recording = film(stage_item(item), capture, seed=item.seed, name=item.name)
+    recording = simulate_recording(item_scenario(item), capture, seed=item.seed, name=item.name)
     save_recording(recording, path)
     return Made(item.name, recording.num_frames, time.perf_counter() - start)
 
 
 def prepare(suite: Suite, folder: Path) -> list[Item]:
-    """Check the output folder and say which recordings are still to be made; partial ones of a killed run are removed.
+    """Check the suite's folder and return the recordings that are missing. Leftovers of an interrupted run are removed.
 
-    The folder may hold the suite with other counts. Raises `RecordingError`, and touches nothing, where it holds something
-    else or another version of the suite.
+    The folder may hold the suite with other counts. Raises `RecordingError`, and changes nothing, where it holds something
+    else or the suite with other settings. The caller holds the lock of `exclusive_folder`.
     """
     home = folder / suite.name
     manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
@@ -203,13 +212,15 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
             found = json.loads((home / MANIFEST).read_text())
         except (OSError, ValueError) as error:
             raise RecordingError(
-                f"{home} holds something else (no readable {MANIFEST}). Name another folder with out=."
+                f"{home} has no readable {MANIFEST}; expected a folder made for this suite, or none. Choose another "
+                "folder, or remove this one."
             ) from error
         differs = {key for key in {*found, *manifest} if found.get(key) != manifest.get(key)}
-        # A recording follows from its variant, split and number: more of them leave those there as they are.
-        if differs - {"counts"}:
+        # A recording is determined by its variant, split and number: other counts or texts leave the recordings valid.
+        if settings := differs - {"counts", "about", "paper"}:
             raise RecordingError(
-                f"{home} holds this suite with other settings ({', '.join(sorted(differs))}). Name another folder with out=."
+                f"{home} holds this suite with other settings ({', '.join(sorted(settings))}). Choose another folder, or "
+                "remove this one."
             )
     else:
         home.mkdir(parents=True)
@@ -221,6 +232,18 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
     return [item for item in suite.items() if not item.path(folder).exists()]
 
 
+@contextlib.contextmanager
+def exclusive_folder(suite: Suite, folder: Path) -> Iterator[None]:
+    """Wait until no other process simulates this suite into this folder, and keep others waiting meanwhile.
+
+    The operating system releases the lock of a process that ends in any way.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f".{suite.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def make_suite(
     suite: Suite,
     folder: Path,
@@ -229,26 +252,31 @@ def make_suite(
     on_done: Callable[[Made], None] | None = None,
     wanted: Callable[[Item], bool] = lambda item: True,
 ) -> list[Made]:
-    """Make what is `wanted` and missing of a suite; finished recordings are kept, whatever happens to the rest.
+    """Simulate the missing recordings of a suite that are `wanted`. Finished recordings are kept if a later one fails.
 
-    Each recording follows from its seed alone, so the number of workers changes nothing in it.
+    Each recording is determined by its seed alone, so the number of workers changes nothing in it. Several processes may
+    call this at once: one simulates, the others wait and find the recordings there.
     """
-    todo = [item for item in prepare(suite, folder) if wanted(item)]
+    with exclusive_folder(suite, folder):
+        missing = [item for item in prepare(suite, folder) if wanted(item)]
+        return _make_items(missing, folder, workers, on_done or (lambda made: None))
+
+
+def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Callable[[Made], None]) -> list[Made]:
     made: list[Made] = []
 
     def finished(one: Made) -> None:
         made.append(one)
-        if on_done is not None:
-            on_done(one)
+        on_done(one)
 
-    if workers <= 1 or len(todo) <= 1:
-        for item in todo:
+    if workers <= 1 or len(items) <= 1:
+        for item in items:
             finished(make_item(item, folder))
         return made
     # Spawned, not forked: JAX's threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(todo)), mp_context=context) as pool:
-        waiting = {pool.submit(make_item, item, folder) for item in todo}
+    with ProcessPoolExecutor(min(workers, len(items)), mp_context=context) as pool:
+        waiting = {pool.submit(make_item, item, folder) for item in items}
         try:
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -265,14 +293,14 @@ def make_items(
     folder: Path,
     *,
     splits: Sequence[str],
-    most: int | None = None,
+    max_per_variant: int | None = None,
     workers: int = 1,
     on_done: Callable[[Made], None] | None = None,
 ) -> list[Item]:
-    """The items of some splits, the first `most` of each variant and split, made where they are missing."""
+    """The items of some splits, at most `max_per_variant` of each variant and split; missing ones are simulated."""
 
     def wanted(item: Item) -> bool:
-        return item.split in splits and (most is None or item.number < most)
+        return item.split in splits and (max_per_variant is None or item.number < max_per_variant)
 
     make_suite(suite, folder, workers=workers, on_done=on_done, wanted=wanted)
     return [item for item in suite.items() if wanted(item)]
@@ -280,7 +308,7 @@ def make_items(
 
 @dataclasses.dataclass(frozen=True)
 class SimulateConfig:
-    """Which suite is simulated, and where to; `benchmark` is a suite's settings (`tagjax.sim.suites.Suite`)."""
+    """Which suite is simulated, and where to; `benchmark` holds the settings of a `Suite`."""
 
     benchmark: Mapping[str, Any]
     out: str = "recordings/benchmark"
@@ -290,4 +318,4 @@ class SimulateConfig:
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
-            raise ValueError(f"workers is {self.workers}; at least 1 process is needed.")
+            raise ValueError(f"workers is {self.workers}; expected at least 1 process.")

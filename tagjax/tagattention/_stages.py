@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..core.numerics import safe_sqrt
 from ..radio.reads import PhaseReads, RadioWindow
-from ..tracing.tracer import Camera, Frame, Later, Trace
+from ..tracing.tracer import BackwardMessage, Camera, Frame, Trace
 from ._evidence import AbstractEvidence
 from .anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
 from .background import Background, empty_background, is_background, remember, shows_rest
@@ -99,9 +99,11 @@ class AbstractStages(AbstractEvidence):
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
         state, seen = self._observe(camera, state, frame)
         view, belief, moved = seen.view, seen.belief, state.phases.moved
-        if frame.later is not None:
-            belief = jax.vmap(self._with_hindsight, in_axes=(None, 0, 0, 0))(view, belief, state.anchor, frame.later)
-            moved = jnp.maximum(moved, frame.later.moved)
+        if frame.backward_message is not None:
+            belief = jax.vmap(self._with_hindsight, in_axes=(None, 0, 0, 0))(
+                view, belief, state.anchor, frame.backward_message
+            )
+            moved = jnp.maximum(moved, frame.backward_message.moved)
         rivals = soft_clip(rival_log_odds(belief.held + belief.near), jnp.exp(self.log_rivalry))
         shown = jax.vmap(self._shown, in_axes=(None, 0, 0))(view, belief, rivals)
         fate, shared = jax.vmap(self._share_fate, in_axes=(None, 0, 0, 0))(seen, shown, state.fate, state.place)
@@ -112,9 +114,11 @@ class AbstractStages(AbstractEvidence):
         # The place prior feeds its own result back; gradients through that loop grow without bound within a second.
         return eqx.tree_at(lambda one: (one.fate, one.place), state, (fate, jax.lax.stop_gradient(place))), out
 
-    def look_back(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Later]:
+    def backward_step(
+        self, camera: Camera, state: TagAttentionState, frame: Frame
+    ) -> tuple[TagAttentionState, BackwardMessage]:
         state, seen = self._observe(camera, state, frame)
-        return state, Later(seen.belief.log_odds, state.anchor, state.phases.moved)
+        return state, BackwardMessage(seen.belief.log_odds, state.anchor, state.phases.moved)
 
     def _observe(
         self, camera: Camera, state: TagAttentionState, frame: Frame
@@ -214,7 +218,7 @@ class AbstractStages(AbstractEvidence):
         spread = diffuse(pooled[..., 0], view.affinity, jax.nn.sigmoid(self.logit_diffusion))
         return refine(pooled[..., 0]), refine(spread)
 
-    def _with_hindsight(self, view: View, belief: Belief, anchor: Anchor, later: Later) -> Belief:
+    def _with_hindsight(self, view: View, belief: Belief, anchor: Anchor, later: BackwardMessage) -> Belief:
         """What one tag's radio says by all frames, those to come included: two-filter smoothing (Fraser and Potter, 1969).
 
         Up to this frame and from it on motion and reads are different ones, so their log odds add up; anchors per antenna.

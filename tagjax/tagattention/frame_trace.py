@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 from ..tracing.tracer import Trace
 from .segmentation import bounding_box
 
-CLAIM = 0.505
-"""A claim takes more confidence than this: what rests stays within half a percent of even odds, where nothing speaks for one."""
+DETECTION_THRESHOLD = 0.505
+"""Confidence above which a tag counts as detected. Without evidence the confidence of a stationary tag stays within 0.005 of 0.5."""
 
 
 def describe(
@@ -37,5 +37,5 @@ def describe(
         centre_m=centre_m,
         step_m=change,
         confidence=confidence,
-        found=(confidence > CLAIM) & (total > 0),
+        detected=(confidence > DETECTION_THRESHOLD) & (total > 0),
     )

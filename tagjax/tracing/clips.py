@@ -1,4 +1,4 @@
-"""Clips: stretches of recordings as device arrays at the working resolution, and the pipeline that draws them."""
+"""Clips: parts of recordings as device arrays at the working resolution."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from .range_windows import host_reads, radio_windows, window_reads
 from .tracer import Camera, Frame
 
 Estimator = Literal["robust", "paper", "truth"]
-"""Of the tags' distances; `truth` takes those of a simulated recording, to tell what the radio costs."""
+"""Range estimator; `truth` uses the true ranges of a simulated recording, to measure what radio errors cost."""
 
 Antennas = tuple[int, ...] | Literal["all"] | None
-"""Which antennas' reads are used, counted from 1; None is the one with the most."""
+"""Antennas whose reads are used, counted from 1; None is the antenna with the most reads."""
 
 _TRUTH_STD_M = 1e-3
 
 
 _one_radio_at_a_time = threading.Lock()
-"""XLA runs a call on a thread of the pool that its parts wait for: on two cores, two calls at once can wait for each other."""
+"""On two cores two concurrent XLA calls can deadlock, each waiting for a thread of the pool that the other holds."""
 
 
 class Clip(eqx.Module):
-    """A stretch of a recording: the camera, and the frames with a leading time axis."""
+    """A part of a recording: the camera, and the frames with a leading time axis."""
 
     camera: Camera
     frames: Frame
@@ -46,21 +46,22 @@ class Clip(eqx.Module):
 
 def check_clip(*, stride: int = 1, window: int = 2, max_reads: int = 1) -> None:
     """Raise `ValueError` for a stride, a window or a number of reads that no clip can have."""
-    for name, found, least, meaning in (
+    for name, value, minimum, meaning in (
         ("stride", stride, 1, "every n-th pixel is kept"),
-        ("window", window, 2, "motion takes two frames"),
+        ("window", window, 2, "motion needs two frames"),
         ("max_reads", max_reads, 1, "reads of one tag in a window"),
     ):
-        if found < least:
-            raise ValueError(f"{name} is {found}; expected at least {least} ({meaning}).")
+        if value < minimum:
+            raise ValueError(f"{name} is {value}; expected at least {minimum} ({meaning}).")
 
 
 def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antennas = None) -> tuple[int, ...]:
-    """The antennas (counted from 1) that distances are to: the given ones, all, or the one with the most reads (None).
+    """The antennas (counted from 1) to which ranges are measured: the given ones, all, or the one with the most reads (None).
 
-    All are those that `antennas_m` places and that have read one of the tags; given ones need have read any tag. With None,
-    reads of known carrier count before others, and of equals the first antenna. Warns (`RecordingWarning`) of the reads that are of no use then.
-    Raises `RecordingError` where no antenna is left.
+    "all" are the antennas that have a position in `antennas_m` and have read one of the tags. A given antenna must have a
+    position and have read any tag. None compares the counts of reads with known carrier first; of equal antennas it takes
+    the first. Warns (`RecordingWarning`) with the number of reads that are then unused. Raises `RecordingError` where no
+    antenna is left.
     """
     reads = recording.reads[np.isin(recording.reads.epc, list(epcs))]
     ports, counts = np.unique(reads.antenna, return_counts=True)
@@ -70,27 +71,28 @@ def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antenna
     if antennas is None or antennas == "all":
         if not placed:
             raise RecordingError(
-                f"{recording.name}: reads: {made}; antennas_m places antennas 1 to {num_placed}. Give all places."
+                f"{recording.name}: found reads: {made}; antennas_m holds positions of antennas 1 to {num_placed}. "
+                "Give the positions of all antennas."
             )
-        told = np.isfinite(reads.carrier_hz)
-        most = max(placed, key=lambda p: (np.sum(told & (reads.antenna == p)), np.sum(reads.antenna == p)))
-        chosen = placed if antennas == "all" else (most,)
+        known = np.isfinite(reads.carrier_hz)
+        busiest = max(placed, key=lambda p: (np.sum(known & (reads.antenna == p)), np.sum(reads.antenna == p)))
+        chosen = placed if antennas == "all" else (busiest,)
     else:
         chosen = antennas
-        heard = {port for port in np.unique(recording.reads.antenna).tolist() if 1 <= port <= num_placed}
-        if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= heard:
+        active = {port for port in np.unique(recording.reads.antenna).tolist() if 1 <= port <= num_placed}
+        if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= active:
             raise RecordingError(
-                f"{recording.name}: antennas {', '.join(map(str, chosen)) or 'none'} asked for; antennas_m places antennas 1 to "
-                f"{num_placed}, of which {', '.join(map(str, sorted(heard))) or 'none'} made reads (of the tags asked for: {made}). "
+                f"{recording.name}: found antennas={list(chosen)}; antennas_m holds positions of antennas 1 to "
+                f"{num_placed}, and antennas {', '.join(map(str, sorted(active))) or 'none'} of these made reads (of the chosen tags: {made}). "
                 "Choose antennas that have both, each once."
             )
     used = np.isin(reads.antenna, chosen)
     if not used.all():
         unread = [epc for epc in epcs if not np.any((reads.epc == epc) & used)]
         warnings.warn(
-            f"{recording.name}: {np.sum(~used)} of {reads.num_reads} reads left out (reads: {made}): distances are to "
-            f"antenna {', '.join(map(str, chosen))}. `antennas=all` uses every antenna that is placed."
-            + (f" Without any read are then: {', '.join(unread)}." if unread else ""),
+            f"{recording.name}: {np.sum(~used)} of {reads.num_reads} reads are unused (reads: {made}): ranges are measured to "
+            f"antenna {', '.join(map(str, chosen))}. `antennas=all` uses every antenna that has a position."
+            + (f" No read is left of: {', '.join(unread)}." if unread else ""),
             RecordingWarning,
             stacklevel=3,
         )
@@ -100,16 +102,16 @@ def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antenna
 def selected_tags(recording: Recording, epcs: Sequence[str] | None) -> tuple[str, ...]:
     """The tags to trace: all that were read if None. Raises `RecordingError` if there is none, or one was never read."""
     try:
-        named = tuple(recording.resolve_epcs(epcs))
+        selected = tuple(recording.resolve_epcs(epcs))
     except RecordingError as error:
         raise RecordingError(f"{recording.name}: {error}") from error
-    if not named:
+    if not selected:
         raise RecordingError(f"{recording.name} holds no tag read: there is nothing to trace.")
-    return named
+    return selected
 
 
-def _thin_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
-    """Every stride-th pixel; where it is missing, the nearest measured one of the cell that it stands for."""
+def _subsampled_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
+    """Every stride-th pixel; where its depth is missing, the nearest valid one of its stride x stride cell."""
     height, width = depth_m.shape[1:]
     padded = np.pad(depth_m, ((0, 0), (0, -height % stride), (0, -width % stride)))
     cells = padded.reshape(len(depth_m), padded.shape[1] // stride, stride, padded.shape[2] // stride, stride)
@@ -137,25 +139,25 @@ def load_clip(
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
-    `stride` keeps every n-th pixel in both directions. The radio is estimated from the recording's start, causally, so
-    that a clip in the middle knows its past; what is the reader's and does not change (share of pi flips, slope and
-    spread of the channels' offsets, mean carrier: `radio_model`) is read off all of the tag's reads first. `antennas` says whose reads are used and to where distances
-    are (see `choose_antennas`). With `colour` the clip holds its pictures, and zero in place of the flow, which is
-    then a network's to make. Raises `RecordingError` for an unknown EPC or antenna or a recording without depth, and
+    `stride` keeps every n-th pixel in both directions. Ranges are estimated causally from the recording's start, so that
+    a clip in the middle uses the reads before it. The constants of the reader (probability of pi flips, slope and spread
+    of the channel offsets, mean carrier: `radio_model`) are fitted to all reads of the tag. `antennas` chooses the
+    antennas (see `choose_antennas`). With `colour` the clip holds the pictures, and zeros in place of the flow, which
+    a network then computes. Raises `RecordingError` for an unknown EPC or antenna or a recording without depth, and
     `ValueError` for frames outside the recording or settings that no clip can have.
     """
     check_clip(stride=stride, window=window, max_reads=max_reads)
     if not 0 <= start < stop <= recording.num_frames:
         raise ValueError(f"Frames {start} to {stop} asked for; {recording.name} has {recording.num_frames}.")
-    named = selected_tags(recording, epcs)
-    chosen = choose_antennas(recording, named, antennas)
+    tags = selected_tags(recording, epcs)
+    chosen = choose_antennas(recording, tags, antennas)
     intrinsics = recording.intrinsics.scaled(stride)
     depth = recording.depth_metres(slice(start, stop))
-    if not np.any(depth):  # frames without are carried, but not a whole recording
+    if not np.any(depth):  # single frames may lack depth, a whole recording may not
         recording.check_has_depth()
     if recording.depth_kind == "range":
         depth = range_to_depth(depth, recording.intrinsics)
-    depth = _thin_depth(depth, stride)
+    depth = _subsampled_depth(depth, stride)
     if colour:
         forward = backward = np.zeros((*depth.shape, 2), np.float32)
     else:
@@ -163,24 +165,24 @@ def load_clip(
             ways[:, ::stride, ::stride] / np.float32(stride) for ways in pair_flow(recording, start, stop, flow)
         )
     time_s = jnp.asarray(recording.frame_time_s(), jnp.float32)
-    counts = [np.sum((recording.reads.epc == epc) & (recording.reads.antenna == a)) for epc in named for a in chosen]
+    counts = [np.sum((recording.reads.epc == epc) & (recording.reads.antenna == a)) for epc in tags for a in chosen]
     length = max(256, -(-int(max(counts)) // 256) * 256)
     origin_ns = int(recording.time_ns[0])
 
-    def heard(epc: str, antenna: int) -> tuple[RadioWindow, PhaseReads]:
+    def radio_of(epc: str, antenna: int) -> tuple[RadioWindow, PhaseReads]:
         buffer = host_reads(recording.reads, epc, origin_ns, length=length, antenna=antenna)
         with _one_radio_at_a_time:
             if estimator == "truth":
                 radio = _true_window(recording, epc, window, antenna)
             else:
                 radio = radio_windows(buffer, time_s, window, estimator)
-            held = radio, _window_reads(buffer, time_s, window, max_reads)
-            return jax.tree.map(lambda leaf: np.asarray(leaf)[start:stop], held)
+            both = radio, _window_reads(buffer, time_s, window, max_reads)
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[start:stop], both)
 
     def stacked(parts):
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *parts)
 
-    radio, reads = jax.tree.map(jnp.asarray, stacked([stacked([heard(e, a) for a in chosen]) for e in named]))
+    radio, reads = jax.tree.map(jnp.asarray, stacked([stacked([radio_of(e, a) for a in chosen]) for e in tags]))
     return Clip(
         camera=Camera(
             rays=jnp.asarray(pixel_rays(intrinsics)),
@@ -195,7 +197,7 @@ def load_clip(
             reads=reads,
             colour=jnp.asarray(recording.colour[start:stop]) if colour else None,
         ),
-        epcs=named,
+        epcs=tags,
         name=recording.name,
         start=start,
         stop=stop,
@@ -203,7 +205,7 @@ def load_clip(
 
 
 def _true_window(recording: Recording, epc: str, num_window: int, antenna: int) -> RadioWindow:
-    """The true distances to the antenna, with next to no doubt; unknown ones are infinitely doubtful."""
+    """True ranges to the antenna with a standard deviation of 1 mm; infinite where the range is unknown."""
     range_m = true_range_m(recording, epc, antenna)
     frame = np.arange(recording.num_frames)
     past = np.maximum(frame[:, None] + np.arange(1 - num_window, 1)[None], 0)
@@ -216,17 +218,17 @@ def _true_window(recording: Recording, epc: str, num_window: int, antenna: int) 
 
 
 def true_range_m(recording: Recording, epc: str, antenna: int) -> np.ndarray:
-    """A tag's true distance at every frame. Raises `RecordingError` if it is not known, or to another antenna."""
+    """A tag's true range at every frame. Raises `RecordingError` if it is unknown, or for another antenna than 1."""
     truth = recording.truth
     if antenna != 1:
         raise RecordingError(
-            f"{recording.name}: estimator=truth, but true ranges are to antenna 1 and the clip's are to antenna {antenna}. "
+            f"{recording.name}: estimator=truth, but true ranges are known to antenna 1 only; found antenna {antenna}. "
             "Set antennas=[1]."
         )
     if truth is None or epc not in truth.tag_range_m:
         there = ", ".join(truth.tag_range_m) if truth is not None else ""
         raise RecordingError(
-            f"{recording.name}: estimator=truth needs the true range of {epc}; truth holds that of: {there or 'no tag'}."
+            f"{recording.name}: estimator=truth needs the true range of {epc}; found ranges of: {there or 'no tag'}."
         )
     return np.asarray(truth.tag_range_m[epc], np.float64)
 
@@ -238,14 +240,14 @@ _window_reads = jax.jit(window_reads, static_argnums=(2, 3))
 class ClipSettings:
     """How recordings become clips."""
 
-    stride: int = 4  # every n-th pixel in both directions
+    stride: int = 4  # every n-th pixel in both directions is kept
     window: int = 5  # frames in a motion vector (k)
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
-    estimator: Estimator = "robust"  # of the tags' distances
-    antennas: Antennas = None  # that distances are to: `all`, numbers from 1, or the one with the most reads if None
+    estimator: Estimator = "robust"  # of the tags' ranges
+    antennas: Antennas = None  # `all`, numbers from 1, or the antenna with the most reads if None
     length: int = 24  # frames of a training clip
-    epcs: tuple[str, ...] | None = None  # all that were read
+    epcs: tuple[str, ...] | None = None  # all tags that were read if None
     least_motion: float = 0.1  # training clips in which no tag is heard to move by so much are not drawn; 0 draws all
     most_tags: int | None = None  # of a training clip: the one that moves most, others by chance; all if None
     workers: int = 0  # processes that load training clips; with none a thread does

@@ -1,4 +1,4 @@
-"""From tag reads to what the tracer needs at every frame: distances over a sliding window, and the reads in it."""
+"""From tag reads to the tracer's radio inputs at every frame: relative ranges over a sliding window, and its reads."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from ..radio.unwrap import unwrap_paper
 from ..recording import TagReads
 
 MAX_GAP_S = 0.5
-"""Without a read for this long nothing is claimed of a tag's motion."""
+"""A gap without reads of this length leaves a tag's motion unknown."""
 
 DEFAULT_FLIP_SHARE = 0.05
-"""Assumed where reads are too sparse to tell a flip from motion."""
+"""Probability of a pi flip where reads are too sparse to distinguish a flip from motion."""
 
 _LENGTH_STEP = 256
 _PAST_KNOTS = 3
@@ -35,9 +35,9 @@ def host_reads(
 ) -> PhaseReads:
     """The reads of one tag as a buffer of NumPy arrays; times in seconds from `origin_ns`.
 
-    Reads of unknown carrier are left out, and those of other antennas than `antenna` (counted from 1) if it is given:
-    a path is the distance to one place, so reads of several antennas are no path. The length is padded to a multiple of 256 unless given, so that tags and
-    recordings share compiled code. An EPC that was never read raises `RecordingError`.
+    Reads of unknown carrier are left out, and so are those of other antennas than `antenna` (counted from 1) if it is
+    given: ranges are estimated to one antenna at a time. The length is padded to a multiple of 256 unless given, so that
+    tags and recordings share compiled code. An EPC that was never read raises `RecordingError`.
     """
     own = reads.select(epc)
     own = own[np.isfinite(own.carrier_hz) & (antenna is None or own.antenna == antenna)]
@@ -72,10 +72,10 @@ def phase_reads(
 
 
 def radio_model(reads: PhaseReads, **settings: float) -> RadioModel:
-    """A `RadioModel` with the pi-flip share and the affine channel offset read off the reads themselves.
+    """A `RadioModel` whose pi-flip probability and affine channel offset are estimated from the reads.
 
-    These are constants of reader and tag, fitted to all reads that are given: of a whole recording, later ones, too. To
-    trace while reads come in, fit them to an earlier recording of the same reader, or give them as `settings`.
+    They are constants of reader and tag and are fitted to all given reads: those of a whole recording include later ones.
+    For online tracing fit them to an earlier recording of the same reader, or give them as `settings`.
     """
     valid = np.asarray(reads.valid)
     host = {name: np.asarray(getattr(reads, name))[valid] for name in ("phase_rad", "time_s", "channel", "carrier_hz")}
@@ -90,8 +90,7 @@ def radio_model(reads: PhaseReads, **settings: float) -> RadioModel:
 
 
 def window_reads(reads: PhaseReads, frame_time_s: Float[Array, " time"], num_window: int, max_reads: int) -> PhaseReads:
-    """For every frame the newest `max_reads` reads since the window's first frame (leading time axis)."""
-
+    """For every frame the latest `max_reads` reads since the window's first frame (leading time axis)."""
     first = frame_time_s[jnp.maximum(jnp.arange(frame_time_s.shape[0]) - num_window + 1, 0)]
     return jax.vmap(lambda start, end: _reads_between(reads, start, end, max_reads))(first, frame_time_s)
 
@@ -99,7 +98,7 @@ def window_reads(reads: PhaseReads, frame_time_s: Float[Array, " time"], num_win
 def _reads_between(
     reads: PhaseReads, first_s: Float[Array, ""], last_s: Float[Array, ""], max_reads: int
 ) -> PhaseReads:
-    """The newest `max_reads` reads of [first_s, last_s] in a buffer of that length."""
+    """The latest `max_reads` reads of [first_s, last_s] in a buffer of that length."""
     stamps = jnp.where(reads.valid, reads.time_s, jnp.inf)
     end = jnp.searchsorted(stamps, last_s, side="right")
     index = end - max_reads + jnp.arange(max_reads, dtype=end.dtype)
@@ -117,7 +116,7 @@ def _window_times(frame_time_s: Float[Array, " time"], num_window: int) -> Float
 def _causal_path(
     path: FilteredPath, reads: PhaseReads, knot_s: Float[Array, " knots"]
 ) -> tuple[Float[Array, " knots"], Float[Array, " knots"]]:
-    """The filtered path at knots, interpolated between reads and held at its ends; and the gap around each knot."""
+    """The filtered path at knots, interpolated between reads and extrapolated after the last, and the gap around each knot."""
     stamps = jnp.where(reads.valid, reads.time_s, jnp.inf)
     until = jnp.searchsorted(stamps, knot_s[-1], side="right")
     upper = jnp.minimum(jnp.searchsorted(stamps, knot_s), until)
@@ -125,8 +124,8 @@ def _causal_path(
     last = jnp.maximum(until - 1, 0)
     upper = jnp.minimum(upper, last)
     span = reads.time_s[upper] - reads.time_s[lower]
-    share = jnp.clip((knot_s - reads.time_s[lower]) / jnp.where(span > 0, span, 1.0), 0.0, 1.0)
-    between = path.distance_m[lower] * (1 - share) + path.distance_m[upper] * share
+    weight = jnp.clip((knot_s - reads.time_s[lower]) / jnp.where(span > 0, span, 1.0), 0.0, 1.0)
+    between = path.distance_m[lower] * (1 - weight) + path.distance_m[upper] * weight
     beyond = jnp.maximum(knot_s - reads.time_s[last], 0.0)
     value = between + jnp.where(until > 0, path.velocity_m_s[last] * beyond, 0.0)
     before = jnp.where(knot_s < reads.time_s[0], jnp.inf, 0.0)
@@ -137,15 +136,15 @@ def _causal_path(
 def robust_windows(
     reads: PhaseReads, frame_time_s: Float[Array, " time"], num_window: int, model: RadioModel, *, max_reads: int = 128
 ) -> RadioWindow:
-    """Causal estimates over every frame's window: grid filter for the basin, least squares for the path.
+    """Causal estimates over every frame's window: the grid filter resolves the ambiguity, least squares refines the path.
 
-    Only reads up to a frame count for its window. `std_m` joins the path's own deviation, the risk of a cycle slip
-    across each gap between reads, and infinity where the window has fewer than two reads or a gap over `MAX_GAP_S`.
+    Only reads up to a frame enter its window. `std_m` combines the variance of the path and that of a possible cycle slip
+    across each gap between reads; it is infinite where the window has fewer than two reads or a gap over `MAX_GAP_S`.
     """
     path = filter_reads(reads, model)
     reference = reference_carrier(reads)
     window_s = _window_times(frame_time_s, num_window)
-    # Knots before the window let sparse reads reach into it.
+    # Knots before the window let reads before it constrain the path where reads are sparse.
     lead = _PAST_SPACING_S * jnp.arange(_PAST_KNOTS, 0, -1, dtype=frame_time_s.dtype)
     knots = jnp.concatenate([window_s[:, :1] - lead[None, :], window_s], axis=1)
     recent = jax.vmap(lambda first, last: _reads_between(reads, first, last, max_reads))(knots[:, 0], knots[:, -1])
@@ -153,13 +152,13 @@ def robust_windows(
     stamps = jnp.where(reads.valid, reads.time_s, jnp.inf)
     gaps = jnp.diff(reads.time_s, prepend=reads.time_s[:1])
     spread = jnp.concatenate([path.velocity_std_m_s[:1], path.velocity_std_m_s[:-1]]) * gaps
-    # A slip needs the prediction to be off by half of the ambiguity, which is half a wavelength.
+    # A cycle slip needs a prediction error of half of the ambiguity; the ambiguity is half a wavelength.
     slip = jnp.where(reads.valid, jax.scipy.special.erfc(quarter_m / jnp.maximum(spread, 1e-6) / jnp.sqrt(2.0)), 0.0)
     risk = jnp.cumsum(slip)
 
     def one(knot_s: Float[Array, " knots"], window: PhaseReads) -> RadioWindow:
         start, gap = _causal_path(path, reads, knot_s)
-        # Frames before the first are its copies; least squares wants distinct knots.
+        # Window frames before the first frame are copies of it; least squares needs distinct knots.
         ordered = knot_s + 1e-4 * jnp.arange(knot_s.shape[0], dtype=knot_s.dtype)
         refined = refine_path(window, ordered, start, reference, model)
         own, covariance = refined.relative_m[_PAST_KNOTS:], refined.covariance_m2[_PAST_KNOTS:, _PAST_KNOTS:]
@@ -178,10 +177,10 @@ def robust_windows(
 
 
 def paper_windows(reads: PhaseReads, frame_time_s: Float[Array, " time"], num_window: int) -> RadioWindow:
-    """The paper's radio side (III.B-C): threshold unwrapping, acceleration rule, polynomial resampling.
+    """Range estimation of TagAttention (III.B-C): threshold unwrapping, acceleration rule, polynomial resampling.
 
-    The paper interpolates after the fact, so a frame also sees the reads right after it. `std_m` is 0 within the
-    reads and infinite outside: the paper claims no uncertainty.
+    The paper interpolates offline, so a frame also uses the reads right after it. `std_m` is 0 between the first and the
+    last read and infinite outside: the paper estimates no uncertainty.
     """
     distance = unwrap_paper(reads)
     count = jnp.sum(reads.valid).astype(reads.time_s.dtype)
@@ -201,9 +200,9 @@ def radio_windows(
     estimator: Literal["robust", "paper"] = "robust",
     model: RadioModel | None = None,
 ) -> RadioWindow:
-    """Distances over the last `num_window` frames by the named estimator: (time, window), metres from each window's first frame.
+    """Ranges over the last `num_window` frames, (time, window), metres relative to each window's first frame.
 
-    Their standard deviations are infinite where nothing is known. `model` None takes `radio_model(reads)`. Raises
+    Their standard deviations are infinite where the range is unknown. `model` None takes `radio_model(reads)`. Raises
     `ValueError` for an unknown estimator.
     """
     if estimator == "paper":

@@ -15,7 +15,7 @@ import numpy as np
 from ..radio.reads import RadioWindow
 from ..recording import Recording, RecordingError
 from ..recording.backwards import played_backwards
-from .tracer import AbstractSmoother, AbstractTracer, Camera, Frame, Later, Trace
+from .tracer import AbstractSmoother, AbstractTracer, BackwardMessage, Camera, Frame, Trace
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +38,8 @@ def _init(tracer: AbstractTracer, camera: Camera, frame: Frame) -> Any:
 
 
 @eqx.filter_jit
-def _step_back(tracer: AbstractSmoother, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Later]:
-    return tracer.look_back(camera, state, frame)
+def _step_back(tracer: AbstractSmoother, camera: Camera, state: Any, frame: Frame) -> tuple[Any, BackwardMessage]:
+    return tracer.backward_step(camera, state, frame)
 
 
 @eqx.filter_jit
@@ -48,15 +48,15 @@ def _step(tracer: AbstractTracer, camera: Camera, state: Any, frame: Frame) -> t
 
 
 def _tags(frame: Frame, first: int, size: int) -> Frame:
-    """One frame (leading time axis kept) with only `size` of the tags; beyond the last one they are never heard."""
+    """One frame (leading time axis kept) with `size` of the tags; places beyond the last tag have no valid read."""
     num_tags = frame.radio.std_m.shape[1]
     chosen = np.arange(first, first + size)
     there = chosen < num_tags
     pick = lambda leaf: leaf[:, chosen.clip(max=num_tags - 1)]  # noqa: E731
     radio, reads = jax.tree.map(pick, frame.radio), jax.tree.map(pick, frame.reads)
-    heard = there[None, :, None, None]
-    radio = RadioWindow(jnp.where(heard, radio.relative_m, 0.0), jnp.where(heard, radio.std_m, jnp.inf))
-    reads = eqx.tree_at(lambda one: one.valid, reads, reads.valid & heard)
+    exists = there[None, :, None, None]
+    radio = RadioWindow(jnp.where(exists, radio.relative_m, 0.0), jnp.where(exists, radio.std_m, jnp.inf))
+    reads = eqx.tree_at(lambda one: one.valid, reads, reads.valid & exists)
     return eqx.tree_at(lambda f: (f.radio, f.reads), frame, (radio, reads))
 
 
@@ -71,14 +71,13 @@ def trace_recording(
 ) -> Iterator[tuple[int, Trace]]:
     """Every frame's number and `Trace` (NumPy leaves, tag axis in the order of `epcs`), frame by frame.
 
-    `load(recording, start, stop, epcs=...)` gives a `Clip`. Pieces of `frames_at_once` frames are read one after the
-    other with the tracer's state carried across, so that memory does not grow with the recording; tags go through in
-    groups of `tags_at_once`, the last one filled up with silent ones, so that one compilation does for all. Tags compete for
-    pixels within their group.
+    `load(recording, start, stop, epcs=...)` returns a `Clip`. Pieces of `frames_at_once` frames are loaded one after
+    the other and the tracer's state is carried across them, so that memory does not grow with the recording. Tags are
+    traced in groups of `tags_at_once`; the last group is padded with tags without reads, so that one compilation serves
+    all groups. Tags compete for pixels within their group.
 
-    With `smooth` in the settings the frames go through backwards first, and what is said of a frame rests on those after
-    it as well; log odds are kept in half precision in a temporary file meanwhile. Raises `RecordingError` for a tracer
-    that is no `AbstractSmoother`.
+    With `smooth` in the settings a backward pass runs first and the trace of a frame uses later frames too; its log odds
+    are kept in half precision in a temporary file. Raises `RecordingError` for a tracer that is no `AbstractSmoother`.
     """
     settings = settings or TraceSettings()
     first, last = frames or (0, recording.num_frames)
@@ -87,16 +86,16 @@ def trace_recording(
             f"{recording.name}: frames {first} to {last} asked for; expected a part of 0 to {recording.num_frames}."
         )
     if not epcs:
-        raise RecordingError(f"{recording.name}: no tag to trace. The recording holds no read, or epcs is empty.")
-    later: Callable[[int], Later] | None = None
+        raise RecordingError(f"{recording.name}: no tag to trace: the recording holds no read, or epcs is empty.")
+    messages: Callable[[int], BackwardMessage] | None = None
     if settings.smooth:
         if not isinstance(tracer, AbstractSmoother):
             raise RecordingError(
-                f"smooth: {type(tracer).__name__} goes forwards only; expected TagAttention. Set scores.smooth=false."
+                f"smooth: {type(tracer).__name__} has no backward pass; expected TagAttention. Set scores.smooth=false."
             )
-        later = _look_back(tracer, recording, load, epcs, settings, (first, last))
-    for number, said in _run(_step, tracer, recording, load, epcs, settings, (first, last), later):
-        yield number, jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(epcs)], *said)
+        messages = _backward_pass(tracer, recording, load, epcs, settings, (first, last))
+    for number, outputs in _run(_step, tracer, recording, load, epcs, settings, (first, last), messages):
+        yield number, jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(epcs)], *outputs)
 
 
 def _run(
@@ -107,57 +106,59 @@ def _run(
     epcs: Sequence[str],
     settings: TraceSettings,
     frames: tuple[int, int],
-    later: Callable[[int], Later] | None = None,
+    messages: Callable[[int], BackwardMessage] | None = None,
 ) -> Iterator[tuple[int, list[Any]]]:
-    """Every frame's number, and what a step says of each group of tags there (NumPy leaves)."""
+    """Every frame's number, and the output of `step` for each group of tags (NumPy leaves)."""
     first, last = frames
     size = min(settings.tags_at_once, len(epcs))
     groups = range(0, len(epcs), size)
     states: list[Any] = [None] * len(groups)
     for start in range(first, last, settings.frames_at_once):
         stop = min(start + settings.frames_at_once, last)
-        overlap = int(start > first)  # a clip's first frame has no flow: read it again, with the frame before
+        overlap = int(start > first)  # the first frame of a clip has no flow: load it with the frame before
         clip = load(recording, start - overlap, stop, epcs=list(epcs))
         parts = [_tags(clip.frames, group, size) for group in groups]
         for index in range(overlap, stop - start + overlap):
-            said = []
-            known = later(start - overlap + index) if later is not None else None
+            outputs = []
+            known = messages(start - overlap + index) if messages is not None else None
             for number, part in enumerate(parts):
                 frame = jax.tree.map(lambda leaf, i=index: jnp.asarray(leaf[i]), part)
                 if known is not None:
                     chosen = slice(groups[number], groups[number] + size)
-                    told = jax.tree.map(lambda leaf, part=chosen: jnp.asarray(leaf[part], jnp.float32), known)
-                    frame = eqx.tree_at(lambda one: one.later, frame, told, is_leaf=lambda leaf: leaf is None)
+                    message = jax.tree.map(lambda leaf, part=chosen: jnp.asarray(leaf[part], jnp.float32), known)
+                    frame = eqx.tree_at(
+                        lambda one: one.backward_message, frame, message, is_leaf=lambda leaf: leaf is None
+                    )
                 if states[number] is None:
                     states[number] = _init(tracer, clip.camera, frame)
                 states[number], out = step(tracer, clip.camera, states[number], frame)
-                said.append(jax.tree.map(np.asarray, out))
-            yield start - overlap + index, said
+                outputs.append(jax.tree.map(np.asarray, out))
+            yield start - overlap + index, outputs
 
 
-def _look_back(
+def _backward_pass(
     tracer: AbstractSmoother,
     recording: Recording,
     load: Callable[..., Any],
     epcs: Sequence[str],
     settings: TraceSettings,
     frames: tuple[int, int],
-) -> Callable[[int], Later]:
-    """Go through the frames backwards; what the later ones say of each can then be asked by its number.
+) -> Callable[[int], BackwardMessage]:
+    """Run the backward pass; the returned function gives the message for a frame by its number.
 
-    Its tag axis is that of all groups, silent tags included.
+    The message's tag axis covers all groups, padding included.
     """
     count, (first, last) = recording.num_frames, frames
-    kept: dict[int, Later] = {}
+    kept: dict[int, BackwardMessage] = {}
     log_odds: np.ndarray | None = None
-    for number, said in _run(
+    for number, outputs in _run(
         _step_back, tracer, played_backwards(recording), load, epcs, settings, (count - last, count - first)
     ):
-        told: Later = jax.tree.map(lambda *leaves: np.concatenate(leaves), *said)
+        message: BackwardMessage = jax.tree.map(lambda *leaves: np.concatenate(leaves), *outputs)
         if log_odds is None:
-            with tempfile.TemporaryFile() as file:  # it has no name, and is gone when the array is
-                log_odds = np.memmap(file, np.float16, "w+", shape=(last - first, *told.log_odds.shape))
+            with tempfile.TemporaryFile() as file:  # unnamed: deleted together with the array
+                log_odds = np.memmap(file, np.float16, "w+", shape=(last - first, *message.log_odds.shape))
         frame = count - 1 - number
-        log_odds[frame - first] = told.log_odds
-        kept[frame] = eqx.tree_at(lambda one: one.log_odds, told, log_odds[frame - first])
+        log_odds[frame - first] = message.log_odds
+        kept[frame] = eqx.tree_at(lambda one: one.log_odds, message, log_odds[frame - first])
     return kept.__getitem__

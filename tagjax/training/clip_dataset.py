@@ -25,7 +25,7 @@ from ..tracing.clips import (
     selected_tags,
     true_range_m,
 )
-from ..tracing.motion_evidence import coherence_lost
+from ..tracing.motion_evidence import coherence_loss
 
 _PIECE_S = 0.5
 """In pieces of this length a clip's reads are asked for motion."""
@@ -44,7 +44,7 @@ def motion_heard(
     most = np.zeros((len(starts), len(epcs)))
     for (tag, epc), antenna in itertools.product(enumerate(epcs), antennas):
         reads = recording.reads.select(epc)
-        lost = coherence_lost(reads[reads.antenna == antenna], edges, int(recording.time_ns[0]))
+        lost = coherence_loss(reads[reads.antenna == antenna], edges, int(recording.time_ns[0]))
         for number, start in enumerate(starts):
             first, last = np.searchsorted(edges, time_s[[start, start + length - 1]], side="right") - 1
             most[number, tag] = max(most[number, tag], lost[first : last + 1].mean())

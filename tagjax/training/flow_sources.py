@@ -19,7 +19,7 @@ from ..core.stream import Stream
 from ..core.types import LazyArray
 from ..flow.picture_pairs import PairSource, StackedPairs, TaughtPairs, VariationSettings, open_sequence, pair_dataset
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
-from ..sim.textures import PHOTOGRAPHS, photograph
+from ..sim.rendering.textures import PHOTOGRAPHS, photograph
 from .flow_teacher import cut_pairs, taught_flow
 
 _BATCH = 16

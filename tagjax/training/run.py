@@ -252,7 +252,7 @@ def held_out_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list
 
 def smoothed(tracers: Mapping[str, AbstractTracer], settings: ScoreSettings) -> set[str]:
     """Names of the tracers that go backwards first: with `settings.smooth` all that can. Raises `ConfigError` if none can."""
-    names = {name for name, tracer in tracers.items() if settings.able(tracer).smooth}
+    names = {name for name, tracer in tracers.items() if settings.supported_by(tracer).smooth}
     if settings.smooth and not names:
         kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
         raise ConfigError(f"scores.smooth: {kinds} goes forwards only; expected TagAttention. Set scores.smooth=false.")
@@ -309,7 +309,7 @@ def evaluate_tracers(
                 loaders[name],
                 stride=clips.stride,
                 epcs=epcs,
-                settings=settings.able(tracers[name]),
+                settings=settings.supported_by(tracers[name]),
                 frames=frames,
             )
         )

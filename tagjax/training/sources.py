@@ -1,19 +1,36 @@
-"""Where recordings come from: stores, the simulator, and virtual tags put on recordings with known tracks."""
+"""Where training and validation recordings come from: stores with optional virtual tags, or a simulated suite."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from ..core.settings import ConfigError
+from rich.console import Console
+
+from ..core.settings import ConfigError, from_mapping
 from ..recording import Recording, RecordingError
 from ..recording.opening import VirtualTagSettings, opened
-from ..recording.store import open_recording, save_recording
+from ..recording.store import open_recording
 from ..tracing.clips import ClipSettings
 
 
+@dataclasses.dataclass(frozen=True)
+class DataSettings:
+    """Training and validation recordings: those named, or the train and validation split of a simulated suite."""
+
+    recordings: tuple[str, ...] = ()
+    validation: tuple[str, ...] = ()
+    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+    suite: Mapping[str, Any] | None = None  # settings of a suite (tagjax.sim.suites.Suite), used without `recordings`
+    suites_folder: str = "recordings/benchmark"  # where suites lie; missing recordings are simulated into it
+    virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+
+
 def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recording]]:
-    """Recordings to train on and held-out ones: those named, or simulated ones where none is named.
+    """Training and validation recordings: those named, or those of `data.suite` where none is named.
 
     Raises `RecordingError` for recordings that cannot be used, or that are in both, and `ConfigError` for settings that
     mean nothing without recordings.
@@ -21,15 +38,20 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
     if not data.recordings:
         if data.validation:
             raise ConfigError(
-                f"data.validation names {', '.join(data.validation)}, but data.recordings is empty: simulated recordings "
-                "would be trained and validated on. Name recordings to train on, or neither."
+                f"data.validation names {', '.join(data.validation)}, but data.recordings is empty: the simulated suite "
+                "would be used for both. Name recordings to train on, or neither."
             )
         if data.virtual_tag != VirtualTagSettings():
             raise ConfigError(
                 "data.virtual_tag is given, but data.recordings is empty; simulated recordings have tags of their own. "
                 "Name the recordings that the virtual tags are put on."
             )
-        return simulated_recordings(data.simulate)
+        if data.suite is None:
+            raise ConfigError(
+                "data.recordings is empty and data.suite is null; expected recordings to train on. Name them with "
+                "data.recordings=[...], or choose data=simulated."
+            )
+        return suite_recordings(data.suite, Path(data.suites_folder))
     held_out = {_place(path) for path in data.validation}
     twice = [path for path in data.recordings if _place(path) in held_out]
     if twice:
@@ -42,54 +64,24 @@ def _place(path: str) -> str:
     return path if "://" in path else str(Path(path).resolve())
 
 
-def simulated_recordings(settings: SimulateSettings) -> tuple[list[Recording], list[Recording]]:
-    """Simulated recordings, made once and kept: the second call only opens them. Needs the sim extra."""
-    training = [_simulated(settings, settings.seed + number) for number in range(settings.num_recordings)]
-    return training, [_simulated(settings, settings.validation_seed)]
+def suite_recordings(settings: Mapping[str, Any], folder: Path) -> tuple[list[Recording], list[Recording]]:
+    """The train and validation split of a suite in `folder`. Missing recordings are simulated (sim extra) and kept.
 
+    Several processes may ask for the same suite at once: one simulates, the others wait. Raises `ConfigError` for a
+    suite without pictures or without training recordings.
+    """
+    from ..sim.suites import PLANAR, Suite, make_items
 
-def _simulated(settings: SimulateSettings, seed: int) -> Recording:
-    scene = dataclasses.asdict(settings)
-    for name in ("num_recordings", "seed", "validation_seed", "folder"):
-        del scene[name]
-    size = (
-        f"{settings.width}x{settings.height}-{settings.num_frames}f-{settings.frame_rate_hz:g}hz-{settings.num_people}p"
+    suite = from_mapping(Suite, settings, where="data.suite")
+    if suite.story == PLANAR or suite.counts.train < 1:
+        raise ConfigError(
+            f"data.suite is {suite.name}, which has no recordings to train on; expected a suite with pictures and "
+            "counts.train of at least 1."
+        )
+    with Console().status(f"recordings of {suite.name} in {folder}: missing ones are simulated"):
+        items = make_items(suite, folder, splits=("train", "validation"), workers=os.cpu_count() or 1)
+    recordings = [(item.split, open_recording(item.path(folder))) for item in items]
+    training, validation = (
+        [recording for one, recording in recordings if one == split] for split in ("train", "validation")
     )
-    path = Path(settings.folder) / f"simulated-{size}-seed{seed}.zarr"
-    if not path.exists():
-        from ..sim.session import SceneSettings, simulate_recording
-
-        made = simulate_recording(SceneSettings(**scene), seed=seed, progress=True)
-        try:
-            save_recording(made, path)
-        except RecordingError:
-            # The jobs of a sweep start at once and make the same recording; the first to finish is as good.
-            if not path.is_dir():
-                raise
-    return open_recording(path)
-
-
-@dataclasses.dataclass(frozen=True)
-class SimulateSettings:
-    """The simulated recordings used where none are named; made once and kept under `folder`."""
-
-    num_recordings: int = 3
-    num_frames: int = 90
-    width: int = 320
-    height: int = 240
-    frame_rate_hz: float = 10.0
-    num_people: int = 3
-    seed: int = 0
-    validation_seed: int = 1000
-    folder: str = "recordings"
-
-
-@dataclasses.dataclass(frozen=True)
-class DataSettings:
-    """What is trained on and what is held out. Without recordings, simulated ones are made."""
-
-    recordings: tuple[str, ...] = ()
-    validation: tuple[str, ...] = ()
-    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
-    simulate: SimulateSettings = dataclasses.field(default_factory=SimulateSettings)
-    virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+    return training, validation

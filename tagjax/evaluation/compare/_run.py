@@ -98,7 +98,7 @@ def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> 
         suite,
         Path(config.out),
         splits=(config.split,),
-        most=config.most,
+        max_per_variant=config.most,
         workers=config.workers,
         on_done=lambda one: tell(f"simulated {one.name}"),
     )
@@ -139,7 +139,7 @@ def _cell(
         told.get("iou"),
         told.get("cle_px"),
         float(np.median(error_m)) * 1e3 if len(error_m) else None,
-        told.get("found"),
+        told.get("detected"),
         float(np.mean(still)) if len(still) else None,
         float(np.median(tally.pace_ms)),
         settings=", ".join(ways) or None,
@@ -177,7 +177,7 @@ def _tally_places(result: RecordingResult, epcs: Sequence[str], claims: Sequence
         frames = result.frames.get(epc)
         if frames is not None:
             gap = np.linalg.norm(place_m[:, tag] - true_m, axis=-1)
-            tally.error_m.append(gap[frames.valid & frames.found])
+            tally.error_m.append(gap[frames.valid & frames.detected])
 
 
 def _watched(
@@ -190,7 +190,7 @@ def _watched(
         if found is None:
             return
         elapsed_s.append(time.perf_counter() - begun)
-        claims.append((np.asarray(found[1].centre_m, np.float64), np.asarray(found[1].found, bool)))
+        claims.append((np.asarray(found[1].centre_m, np.float64), np.asarray(found[1].detected, bool)))
         yield found
 
 

@@ -130,7 +130,9 @@ class Systems:
         if key not in self._tracers:
             self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings.tracer)
         tracer = self._tracers[key]
-        return trace_recording(tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.able(tracer))
+        return trace_recording(
+            tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.supported_by(tracer)
+        )
 
     def _plane(self, item: Item, recording: Recording) -> PlaneCamera:
         """The camera as it was calibrated on the table, which both TagVision and Tagview take."""

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...baselines.tagvision import PHASE_NOISE_RAD, phase_score, theory_rad
-from ...sim.planar import PlanarSettings, planar_trials
+from ...sim.radio.planar import PlanarSettings, planar_trials
 
 
 @dataclasses.dataclass(frozen=True)

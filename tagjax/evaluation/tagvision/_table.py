@@ -11,10 +11,10 @@ from jaxtyping import Float
 from ...baselines._interface import HostCamera, host_frames
 from ...baselines.tagvision import Match, MatchSettings, PlaneCamera, TagVision, TagVisionSettings, heading, match_tags
 from ...recording import Recording
-from ...sim.objects import bounds
-from ...sim.raycast import look_at
-from ...sim.suites import Item, stage_item
-from ...sim.world import STEP_S
+from ...sim.rendering.viewpoint import look_at
+from ...sim.suites import Item, item_scenario
+from ...sim.world.bodies import STEP_S
+from ...sim.world.objects import bounds
 
 SAME_M = 0.15
 """A track whose median distance to an object is more than this is not that object's."""
@@ -31,19 +31,19 @@ class TableTruth:
 
 
 def table_truth(item: Item, recording: Recording) -> TableTruth:
-    """The truth of a recording of a table-top suite, from the world it was filmed in; x y from below the camera.
+    """The truth of a recording of a table-top suite, from the simulated world; x y from below the camera.
 
     Raises `ValueError` where no tagged thing moves, or they do not move on one plane.
     """
-    filmed = stage_item(item)
-    view, world = look_at(recording.intrinsics, filmed.camera_position_m, filmed.camera_look_at_m), filmed.world
+    scenario = item_scenario(item)
+    view, world = look_at(recording.intrinsics, scenario.camera_position_m, scenario.camera_look_at_m), scenario.world
     hosts = {tag.epc: world.bodies[tag.body] for tag in world.tags}
     lowest = [body.poses.position_m[0, 2] + bounds(body.shapes)[0][2] for body in hosts.values()]
     if not hosts or np.ptp(lowest) > 1e-3 or recording.truth is None:
         raise ValueError(
             f"{item.name}: tagged things stand at {lowest} m; expected some, all on one table, with truth."
         )
-    x, y = filmed.camera_position_m[:2]
+    x, y = scenario.camera_position_m[:2]
     origin, turn = np.array([x, y, float(np.mean(lowest))]), view.rotation.T
     camera = PlaneCamera(recording.intrinsics, turn, -turn @ (np.asarray(view.position_m, float) - origin))
     steps, at = np.arange(world.num_steps) * STEP_S, recording.time_ns * 1e-9
@@ -103,7 +103,7 @@ def see(
         state, said = tracer.step(setup, state, frame)
         world = camera.to_world(np.asarray(said.centre_m, np.float64))
         for tag, epc in enumerate(epcs):
-            claimed[epc].append(world[tag] if bool(said.found[tag]) else missing)
+            claimed[epc].append(world[tag] if bool(said.detected[tag]) else missing)
         if on_frame is not None:
             on_frame()
     time_s, paths = state.paths()

@@ -1,0 +1,1 @@
+"""The simulated reader: radio channel, inventory rounds, clocks and noise."""
