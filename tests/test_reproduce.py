@@ -25,12 +25,12 @@ from tagjax.evaluation.reproduce.make import make_table
 from tagjax.evaluation.reproduce.markdown import differing, not_made, rendered, replaced, write_pages
 from tagjax.evaluation.reproduce.measure import Inputs, Tracing, measure
 from tagjax.evaluation.reproduce.provenance import blob_id, changes, dependencies, revision
-from tagjax.evaluation.reproduce.recipe import Job, Recipe
+from tagjax.evaluation.reproduce.recipe import COUNTS, MEASURES, Job, Recipe
 from tagjax.evaluation.reproduce.scores import RecordingScores
 from tagjax.evaluation.reproduce.status import stale, status
 from tagjax.evaluation.reproduce.table import begin, filled, read_table, table_path, write_table
 from tagjax.metrics.recordings import RecordingResult, ScoreSettings
-from tagjax.metrics.tracking import FrameScores
+from tagjax.metrics.tracking import FrameScores, Scores
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted((ROOT / "conf" / "table").glob("*.yaml"))
@@ -132,7 +132,9 @@ def test_an_interval_agrees_with_the_closed_form_for_a_mean():
     found = ratio_estimate(totals, counts)
     mean, error = totals.sum() / counts.sum(), np.std(totals / 50) / np.sqrt(400)
     assert found.value == pytest.approx(mean, abs=1e-12)
-    np.testing.assert_allclose([found.low, found.high], [mean - 1.96 * error, mean + 1.96 * error], atol=0.1 * error)
+    assert found.low is not None
+    assert found.high is not None
+    np.testing.assert_allclose((found.low, found.high), [mean - 1.96 * error, mean + 1.96 * error], atol=0.1 * error)
 
 
 def test_an_interval_agrees_with_resampling_by_hand_where_recordings_differ_in_length():
@@ -142,6 +144,8 @@ def test_an_interval_agrees_with_resampling_by_hand_where_recordings_differ_in_l
     drawn = np.random.default_rng(5).integers(0, 12, (50_000, 12))
     means = totals[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     found = ratio_estimate(totals, counts)
+    assert found.low is not None
+    assert found.high is not None
     np.testing.assert_allclose([found.low, found.high], np.quantile(means, [0.025, 0.975]), atol=0.015)
     assert found == ratio_estimate(totals, counts)
 
@@ -290,6 +294,14 @@ def test_json_of_something_else_is_refused(tmp_path: Path):
             "protocol: found whole; expected some of part",
         ),
         ({"systems": {}}, "system: found online; expected some of none"),
+        (
+            {"rows": [{"label": "a", "suite": "small", "protocol": "part", "system": {"ioo": "online"}}]},
+            "system: found ioo; expected some of iou, all",
+        ),
+        (
+            {"rows": [{"label": "a", "suite": "small", "protocol": "part", "system": {"iou": "offline"}}]},
+            "system: found offline; expected some of online",
+        ),
         ({"systems": {"online": {"tracer": "a", "clips": {"strid": 2}}}}, "strid"),
         ({"depends": []}, "depends is empty"),
         ({"depends": ["../other/*.py"]}, "a path within the repository"),
@@ -300,6 +312,20 @@ def test_json_of_something_else_is_refused(tmp_path: Path):
 def test_a_recipe_that_cannot_be_made_is_refused(changed: dict[str, Any], message: str):
     with pytest.raises(ConfigError, match=message):
         _recipe(**changed)
+
+
+def test_every_measure_is_one_that_scores_have():
+    scores = _result().scores().merge(Scores.of_unlabelled(np.ones(3, bool)))
+    assert set(MEASURES) - set(COUNTS) - {"locked"} <= set(scores.means)
+
+
+def test_columns_of_a_row_may_be_of_other_systems():
+    systems = {"a": {"tracer": "tagattention_paper"}, "b": {"tracer": "tagattention_handheld"}}
+    row = {"label": "a", "suite": "small", "protocol": "part", "system": {"iou": "a", "all": "b"}}
+    recipe = _recipe(rows=[row], systems=systems)
+    assert [job.system for job in recipe.jobs()] == ["a", "b"]
+    assert recipe.job(recipe.rows[0], "locked") is None
+    assert recipe.tracers() == ["tagattention_paper", "tagattention_handheld"]
 
 
 @pytest.mark.parametrize(
@@ -324,9 +350,9 @@ def _result() -> RecordingResult:
         mask_j=np.full(3, 0.5),
         identified=np.array([1, 1, 2]),
         confidence=np.ones(3),
-        found=np.array([True, True, True]),
-        shown=np.ones(3, bool),
-        moved=np.array([False, True, True]),
+        detected=np.array([True, True, True]),
+        visible=np.ones(3, bool),
+        has_moved=np.array([False, True, True]),
         label=1,
     )
     return RecordingResult(truth, {"tag-a": frames, "tag-b": frames}, [], ScoreSettings(lock_frames=2))

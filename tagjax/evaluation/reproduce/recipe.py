@@ -22,7 +22,7 @@ Split = Literal["train", "validation", "test"]
 COUNTS = ("num_recordings", "num_tags", "num_frames")
 """Measures that only count what a cell's scores are the mean of."""
 
-MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "false_claims", *COUNTS)
+MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "false_detections", *COUNTS)
 """What a column can show: scores of `tagjax.metrics.tracking.Scores`, `locked` (of all tags), and counts."""
 
 
@@ -74,11 +74,10 @@ class Recorded:
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """A column: its heading, the measures that it shows, and of which system (the row's if None)."""
+    """A column: its heading, and the measures that it shows."""
 
     heading: str
     measures: tuple[str, ...] = ()  # none: a column of recorded values
-    system: str | None = None
     interval: bool = False  # whether the first measure is followed by its 95 % interval
 
     def __post_init__(self) -> None:
@@ -96,7 +95,7 @@ class Row:
     split: Split = "test"
     seeds: tuple[int, ...] | None = None  # the suite's recordings drawn with these seeds together; its own seed if None
     protocol: str | None = None
-    system: str | None = None  # where the columns name none
+    system: str | Mapping[str, str] | None = None  # of all columns, or by the name of the column
     recorded: Mapping[str, Recorded] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -147,33 +146,29 @@ class Recipe:
             self._check(f"row {row.label!r}: recorded", row.recorded, self.columns)
             if row.kind == "score":
                 self._check(f"row {row.label!r}: protocol", [row.protocol], self.protocols)
-                self._check(f"row {row.label!r}: system", [row.system] if row.system else [], self.systems)
-        for name, column in self.columns.items():
-            self._check(f"column {name}: system", [column.system] if column.system else [], self.systems)
+                by_column = row.system if isinstance(row.system, Mapping) else {}
+                self._check(f"row {row.label!r}: system", by_column, self.columns)
+                named = by_column.values() if by_column else [row.system] if row.system else []
+                self._check(f"row {row.label!r}: system", named, self.systems)
 
     @staticmethod
     def _check(where: str, found: Any, known: Mapping[str, Any]) -> None:
         if unknown := [str(name) for name in found if name not in known]:
             raise ConfigError(f"{where}: found {', '.join(unknown)}; expected some of {', '.join(known) or 'none'}.")
 
-    def job(self, row: Row, column: Column) -> Job | None:
+    def job(self, row: Row, column: str) -> Job | None:
         """What the cell of a row and a column needs measured; None for a recorded or an empty cell."""
-        system = column.system or row.system
-        if row.kind != "score" or system is None or not column.measures:
+        system = row.system.get(column) if isinstance(row.system, Mapping) else row.system
+        if row.suite is None or row.protocol is None or system is None or column in row.recorded:
             return None
-        assert row.suite is not None
-        assert row.protocol is not None
+        if not self.columns[column].measures:
+            return None
         return Job(row.suite, row.split, row.seeds, row.protocol, system)
 
     def jobs(self) -> list[Job]:
         """What is to be measured, each once, in the order of the table."""
-        found = [
-            job
-            for row in self.rows
-            for name, column in self.columns.items()
-            if name not in row.recorded and (job := self.job(row, column)) is not None
-        ]
-        return list(dict.fromkeys(found))
+        found = [self.job(row, column) for row in self.rows for column in self.columns]
+        return list(dict.fromkeys(job for job in found if job is not None))
 
     def suites(self) -> list[str]:
         """Names of the suites that are measured on."""

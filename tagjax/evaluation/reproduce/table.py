@@ -72,7 +72,7 @@ def _cell(
     """One cell: recorded, or with its values, intervals and counts; None where it is empty."""
     if name in row.recorded:
         return {"kind": "recorded", **dataclasses.asdict(row.recorded[name])}
-    job = recipe.job(row, column)
+    job = recipe.job(row, name)
     if job is None:
         return None
     found = scores[job]
