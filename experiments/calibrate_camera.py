@@ -1,4 +1,4 @@
-"""Calibrate a camera from pictures of a checkerboard, and place it over the plane that the board lies on.
+r"""Calibrate a camera from pictures of a checkerboard, and find its pose over the plane on which the board lies.
 
 python -m experiments.calibrate_camera pictures=<folder> board.columns=7 board.rows=5 board.square_m=0.041
 python -m experiments.calibrate_camera pictures=<folder> 'poses=[{picture: table.png}]' out=camera.json
@@ -8,38 +8,31 @@ python -m experiments.calibrate_camera pictures=<folder> \
 
 from __future__ import annotations
 
-import hydra
-from omegaconf import DictConfig
+from pathlib import Path
+from typing import Any
 
-from .errors import in_a_line
-from .help import answer_help
-from .train import CONFIGS, resolved
+from .command import checked, command
 
 
-@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="calibrate_camera")
-def main(config: DictConfig) -> None:
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
     from tagjax.baselines.tagvision import CalibrateSettings, calibrate_folder, write_calibration, write_corners
-    from tagjax.core.settings import from_mapping
 
-    values = resolved(config)
     if values["pictures"] is None:
-        raise SystemExit("calibrate_camera: give pictures=<folder of pictures of the checkerboard>.")
-    console = Console(soft_wrap=True, highlight=False)
-    with in_a_line("calibrate_camera"):
-        settings = from_mapping(CalibrateSettings, values)
-        found = calibrate_folder(settings)
-        write_calibration(found, settings.out)
-        drawn = write_corners(found, settings.out)
-    told = (
-        f"a board looks the same from either end: {drawn} shows the first corner and the axes. Where it is the other end "
-        "than you mean, give that corner's place as origin_m and turn_deg 180 more."
+        raise ValueError("found no pictures; expected pictures=<folder of pictures of the checkerboard>.")
+    settings, console = checked(CalibrateSettings, values, folder), Console(soft_wrap=True, highlight=False)
+    calibration = calibrate_folder(settings)
+    write_calibration(calibration, settings.out)
+    drawn = write_corners(calibration, settings.out)
+    warning = (
+        f"a board looks the same from either end: {drawn} shows the first corner and the axes. Where the other end was "
+        "meant, give that corner's position as origin_m and add 180 to turn_deg."
     )
-    for line in (*found.said(), *([told] if settings.poses else []), f"written to {settings.out} and {drawn}"):
+    for line in (*calibration.said(), *([warning] if settings.poses else []), f"written to {settings.out} and {drawn}"):
         console.print(line, markup=False)
 
 
 if __name__ == "__main__":
-    answer_help(__doc__, "calibrate_camera")
     main()

@@ -1,48 +1,36 @@
 """Goller et al.: calibrate on a tag grid, run the scenarios, write both tables, metrics and plots to the run folder.
 
-python -m experiments.simulate benchmark=shop_grid     # and shop_exit, shop_handover
+python -m experiments.simulate suite=shop_grid         # and shop_exit, shop_handover
 python -m experiments.goller
-python -m experiments.goller handover=<recording>      # not those of shop_handover beside the scenarios
-python -m experiments.goller scenarios=<folder of the suite> most=3 fit_steps=0
+python -m experiments.goller handover=<recording>      # in place of those of shop_handover beside the scenarios
+python -m experiments.goller scenarios=<folder of the suite> max_recordings=3 fit_steps=0
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-
-from .errors import in_a_line
-from .help import answer_help
-from .train import CONFIGS, resolved
+from .command import checked, command, print_result
 
 
-@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="goller")
-def main(config: DictConfig) -> None:
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
-    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.goller import GollerConfig, run_goller
     from tagjax.recording.store import open_recording
 
-    values = resolved(config)
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
-    console = Console()
-    with in_a_line("goller"), console.status("observing", spinner="line") as status:
-        checked = from_mapping(GollerConfig, values)
-        metrics = run_goller(checked, open_recording, folder, on_done=lambda name: status.update(f"observed {name}"))
+    config, console = checked(GollerConfig, values, folder), Console()
+    with console.status("tracking", spinner="line") as status:
+        metrics = run_goller(config, open_recording, folder, on_done=lambda name: status.update(f"tracked {name}"))
     console.print((folder / "tables.md").read_text(), markup=False)
     if metrics["handover"] is None:
-        told = "no hand-over: `python -m experiments.simulate benchmark=shop_handover` makes recordings of some"
-        console.print(told, soft_wrap=True, highlight=False)
+        hint = "found no hand-over; `python -m experiments.simulate suite=shop_handover` makes recordings of some"
+        console.print(hint, soft_wrap=True, highlight=False)
     console.print(f"run folder: {folder}")
-    print(json.dumps(metrics, allow_nan=False))
+    print_result(metrics)
 
 
 if __name__ == "__main__":
-    answer_help(__doc__, "goller")
     main()

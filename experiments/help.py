@@ -1,50 +1,97 @@
-"""What `--help` tells: what a command is for, what can be chosen, and its configuration with the comments that explain it."""
+"""The text of `--help`: what the command does, its groups with their choices, and every key with its comment.
+
+Hydra prints it, for conf/hydra/default.yaml names it as the help's template. So overrides count: with
+`--help tracer=tagattention_paper` the keys of that tracer are shown.
+"""
 
 from __future__ import annotations
 
+import importlib
 import re
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
-_CONF = Path(__file__).resolve().parents[1] / "conf"
-
-
-def answer_help(about: str | None, config_name: str) -> None:
-    """Print `help_text` and end the program, if its arguments ask for help. Hydra's own is `--hydra-help`."""
-    if {"--help", "-h"} & set(sys.argv[1:]):
-        print(help_text(about or "", config_name))
-        raise SystemExit(0)
+_LINE = re.compile(r"^(\s*)(?:- )?([\w.]+):(.*)$")
+_COMMENT = re.compile(r"(?:^|\s)# (.*)$")
 
 
-def help_text(about: str, config_name: str) -> str:
-    """The command's docstring, its groups with their choices, and its own file under conf/ with comments."""
-    path = _CONF / f"{config_name}.yaml"
-    parts = [about.strip()]
-    groups = [_group_line(name, chosen) for name, chosen in _defaults(path)]
-    if groups:
-        parts.append("\n".join(["Groups (name=choice; each choice is a file of conf/<group>/):", *groups]))
-    parts.append(f"Keys (name=value, a.b=value), as they come:\n{_own_lines(path)}")
-    parts.append("`--cfg job` prints everything as composed; `--hydra-help` is about Hydra's own options.")
-    return "\n\n".join(parts)
+def command_help(conf: Path, *, _root_: DictConfig) -> str:
+    """The help of the command that the composed configuration `_root_` is of; `conf` is the folder of the configuration."""
+    name = str(_root_.hydra.job.name)
+    choices = {str(group): choice for group, choice in _root_.hydra.runtime.choices.items()}
+    about = importlib.import_module(f"{__package__}.{name}").__doc__ or ""
+    groups = [
+        f"  {group}={'null' if choice is None else choice}  ({', '.join(_options(conf, group))})"
+        for group, choice in sorted(choices.items())
+        if not group.startswith("hydra") or group in ("hydra/launcher", "hydra/sweeper")
+    ]
+    text = "\n\n".join(
+        [
+            about.strip(),
+            "\n".join(["Groups (group=choice; a choice is a file conf/<group>/<choice>.yaml):", *groups]),
+            f"Keys (name=value, a.b=value) and their values as composed:\n{_keys(conf, name, choices, _root_)}",
+            "`--help group=choice` shows the keys of that choice; `--hydra-help` is about Hydra's own options.",
+        ]
+    )
+    return text.replace("$", "$$")  # Hydra takes the text as a string.Template
 
 
-def _defaults(path: Path) -> list[tuple[str, str | None]]:
-    """The groups of a file's defaults list, as they are overridden, and what is chosen."""
+def _options(conf: Path, group: str) -> list[str]:
+    folder = group.partition("@")[0]
+    if folder.startswith("hydra/"):
+        from hydra.core.global_hydra import GlobalHydra
+
+        return GlobalHydra.instance().config_loader().get_group_options(folder)
+    return sorted(path.stem for path in (conf / folder).glob("*.yaml"))
+
+
+def _keys(conf: Path, name: str, choices: dict[str, str | None], config: DictConfig) -> str:
+    comments = dict(_comments(conf / f"{name}.yaml", ""))
+    for group, choice in choices.items():
+        folder, _, package = group.partition("@")
+        # A key without a comment of its own has that of the group's default.
+        for path in [*_chain(conf / folder / "default.yaml"), *_chain(conf / folder / f"{choice}.yaml")]:
+            comments |= dict(_comments(path, package or folder.replace("/", ".")))
+    own = OmegaConf.create({key: value for key, value in config.items_ex(resolve=False) if key != "hydra"})
+    lines = []
+    for path, line in _paths(OmegaConf.to_yaml(own).splitlines()):
+        comment = comments.get(path)
+        lines.append(f"{line}  # {comment}" if comment else line)
+    return "\n".join(lines)
+
+
+def _chain(path: Path) -> Iterator[Path]:
+    """A group's file after those of the same group that its defaults list names."""
+    if not path.is_file():
+        return
     config = OmegaConf.load(path)
-    assert isinstance(config, DictConfig)
-    listed = config.get("defaults", ListConfig([]))
-    found = [next(iter(one.items())) for one in listed if isinstance(one, DictConfig)]
-    return [(str(name).removeprefix("optional ").strip("/"), chosen) for name, chosen in found]
+    for one in (config.get("defaults") or []) if isinstance(config, DictConfig) else []:
+        if isinstance(one, str) and one != "_self_":
+            yield from _chain(path.with_name(f"{one}.yaml"))
+    yield path
 
 
-def _group_line(name: str, chosen: str | None) -> str:
-    choices = sorted(path.stem for path in (_CONF / name.split("@")[0]).glob("*.yaml"))
-    return f"  {name}={chosen or 'null'}  ({', '.join(choices)})"
+def _comments(path: Path, package: str) -> Iterator[tuple[str, str]]:
+    """(dotted path, comment) of every key of a file that has a comment on its own line."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    prefix = "" if any(line.startswith("# @package _global_") for line in lines) or not package else f"{package}."
+    for key, line in _paths(lines):
+        found = _COMMENT.search(line)
+        if key and found:
+            yield prefix + key, found[1]
 
 
-def _own_lines(path: Path) -> str:
-    """The file without its defaults list and Hydra's part."""
-    blocks = re.split(r"^(?=\S)", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    return "".join(block for block in blocks if not block.startswith(("defaults:", "hydra:"))).strip()
+def _paths(lines: list[str]) -> Iterator[tuple[str, str]]:
+    """Every line of a YAML text with the dotted path of its key; an empty path for lines without a key."""
+    open_keys: list[tuple[int, str]] = []
+    for line in lines:
+        found = _LINE.match(line)
+        if found is None or line.lstrip().startswith(("#", "- ")):
+            yield "", line
+            continue
+        indent = len(found[1])
+        open_keys = [(depth, key) for depth, key in open_keys if depth < indent]
+        open_keys.append((indent, found[2]))
+        yield ".".join(key for _, key in open_keys), line

@@ -1,25 +1,22 @@
-"""Simulate a benchmark suite: the same name and seed give the same recordings; what is there already is kept.
+"""Simulate a suite: the same name and seed give the same recordings; existing recordings are kept.
 
-python -m experiments.simulate benchmark=multi_4
-python -m experiments.simulate benchmark=corpus benchmark.counts.train=200 out=recordings/corpus workers=8
-python -m experiments.simulate benchmark=crowd smoke=true out=recordings/smoke
-python -m experiments.simulate -m 'benchmark=glob(*)' sheet=docs/benchmark   # the pictures of docs/benchmark.md again
+python -m experiments.simulate suite=multi_4
+python -m experiments.simulate suite=corpus suite.counts.train=200 paths.recordings_dir=recordings/corpus workers=8
+python -m experiments.simulate suite=crowd smoke=true paths.recordings_dir=recordings/smoke
+python -m experiments.simulate -m 'suite=glob(*)' sheet=docs/benchmark   # the pictures of docs/benchmark.md
 """
 
 from __future__ import annotations
 
-import hydra
-from omegaconf import DictConfig
+from pathlib import Path
+from typing import Any
 
-from .errors import in_a_line
-from .help import answer_help
-from .train import CONFIGS, resolved
+from .command import checked, command
 
 
-@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="simulate")
-def main(config: DictConfig) -> None:
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
     import os
-    from pathlib import Path
 
     from rich.console import Console
 
@@ -29,38 +26,31 @@ def main(config: DictConfig) -> None:
 
     from .progress import counting_bar
 
-    values = resolved(config)
-    sheets = values.pop("sheet", None)
-    if values.get("benchmark") is None:
-        raise SystemExit("simulate: name a suite: benchmark=<name>. `--help` lists them.")
-    with in_a_line("simulate"):
-        checked = from_mapping(SimulateConfig, values)
-        suite = from_mapping(Suite, checked.benchmark, where="benchmark")
-    suite = suite.smoke() if checked.smoke else suite
-    console = Console()
-    if sheets is not None:
-        console.print(f"{suite.name}: {save_preview(suite, Path(sheets), workers=checked.workers or 1)}")
+    if values.get("suite") is None:
+        raise ValueError("found no suite; expected suite=<name>. `--help` lists the names.")
+    config = checked(SimulateConfig, values, folder)
+    suite = from_mapping(Suite, config.suite, where="suite")
+    suite = suite.smoke() if config.smoke else suite
+    recordings_dir, console = Path(config.recordings_dir), Console()
+    if config.sheet is not None:
+        console.print(f"{suite.name}: {save_preview(suite, Path(config.sheet), workers=config.workers or 1)}")
         return
-    total = len(suite.items())
-    with counting_bar(console, shown=checked.progress) as bar:
-        task = bar.add_task(suite.name, total=total)
-        here = sum(item.path(Path(checked.out)).exists() for item in suite.items())
-        bar.update(task, completed=here)
-        with in_a_line("simulate"):
-            made = make_suite(
-                suite,
-                Path(checked.out),
-                workers=checked.workers or os.cpu_count() or 1,
-                on_done=lambda one: bar.update(task, advance=1, description=one.name),
-            )
+    items = suite.items()
+    with counting_bar(console, shown=config.progress) as bar:
+        task = bar.add_task(suite.name, total=len(items))
+        bar.update(task, completed=sum(item.path(recordings_dir).exists() for item in items))
+        made = make_suite(
+            suite,
+            recordings_dir,
+            workers=config.workers or os.cpu_count() or 1,
+            on_done=lambda one: bar.update(task, advance=1, description=one.name),
+        )
     frames, elapsed_s = sum(one.num_frames for one in made), sum(one.elapsed_s for one in made)
-    pace = f", {frames / elapsed_s:.1f} frames/s a process" if frames else ""
-    sheet = save_sheet(suite, Path(checked.out))
-    console.print(
-        f"{suite.name}: {len(made)} made, {total - len(made)} there already, in {checked.out}{pace}; {sheet.name}"
-    )
+    speed = f", {frames / elapsed_s:.1f} frames/s a process" if frames else ""
+    sheet = save_sheet(suite, recordings_dir)
+    kept = len(items) - len(made)
+    console.print(f"{suite.name}: {len(made)} made, {kept} kept, in {recordings_dir}{speed}; {sheet.name}")
 
 
 if __name__ == "__main__":
-    answer_help(__doc__, "simulate")
     main()

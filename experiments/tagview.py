@@ -1,69 +1,50 @@
-"""Tagview's experiments on simulated suites: trains named, tables and plots; or its detector trained.
+"""Tagview's experiments on simulated suites: identified toy trains, tables and plots; or its detector trained.
 
-python -m experiments.simulate benchmark=ceiling_2     # and ceiling_3 to ceiling_6, separated_traces, half_wavelength
+python -m experiments.simulate suite=ceiling_2         # and ceiling_3 to ceiling_6, separated_traces, half_wavelength
 python -m experiments.tagview
-python -m experiments.tagview most=4 'suites=[ceiling_4]' system.detector.kind=motion
+python -m experiments.tagview max_recordings=4 'suites=[ceiling_4]' system.detector.kind=motion
 python -m experiments.tagview command=train            # writes detector.npz to the run folder
 python -m experiments.tagview system.detector.weights=<file>
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-
-from .errors import in_a_line
-from .help import answer_help
-from .train import CONFIGS, resolved
+from .command import checked, command, print_result, write_config
+from .suites import suites_named
 
 
-@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="tagview")
-def main(config: DictConfig) -> None:
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
     from rich.progress import Progress
 
-    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.tagview import TagviewExperiment, run_tagview, table, train_tagview
 
-    values = resolved(config)
-    command, progress = values.pop("command"), values.pop("progress")
-    if command not in ("run", "train"):
-        raise SystemExit(f"tagview: command is {command!r}; expected run or train.")
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.save(OmegaConf.create({"command": command, **values}), folder / "config.yaml")
-    console = Console()
-    with in_a_line("tagview"):
-        checked = from_mapping(TagviewExperiment, values)
-        with Progress(console=console, disable=not progress) as bar:
-            task = bar.add_task("tagview", total=None)
-            if command == "train":
-                total = checked.training.recipe.num_steps
-                metrics = train_tagview(
-                    checked,
-                    folder,
-                    on_step=lambda step, loss: bar.update(
-                        task, completed=step, total=total, description=f"loss {loss:.3f}"
-                    ),
-                )
-            else:
-                metrics = run_tagview(
-                    checked,
-                    folder,
-                    on_progress=lambda name, number, total: bar.update(
-                        task, completed=number, total=total, description=name
-                    ),
-                )
-    if command == "run":
-        console.print(Markdown(table(metrics)))
-    console.print(f"all of it in {folder}", soft_wrap=True, highlight=False)
-    print(json.dumps(metrics, allow_nan=False))
+    asked, progress = values.pop("command"), values.pop("progress")
+    if asked not in ("run", "train"):
+        raise ValueError(f"command is {asked!r}; expected run or train.")
+    suites_named(values["suites"])
+    config, console = checked(TagviewExperiment, values, folder), Console()
+    write_config({"command": asked, **values}, folder)
+    with Progress(console=console, disable=not progress) as bar:
+        task = bar.add_task("tagview", total=None)
+
+        def report(name: str, number: int, total: int) -> None:
+            bar.update(task, completed=number, total=total, description=name)
+
+        if asked == "train":
+            steps = config.training.recipe.num_steps
+            metrics = train_tagview(config, folder, on_step=lambda step, loss: report(f"loss {loss:.3f}", step, steps))
+        else:
+            metrics = run_tagview(config, folder, on_progress=report)
+            console.print(Markdown(table(metrics)))
+    console.print(f"run folder: {folder}", soft_wrap=True, highlight=False)
+    print_result(metrics)
 
 
 if __name__ == "__main__":
-    answer_help(__doc__, "tagview")
     main()

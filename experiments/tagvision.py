@@ -1,47 +1,33 @@
-"""TagVision's experiments: parallel lines, calibration, things that move over a table; the last line is JSON.
+"""TagVision's experiments: parallel lines, calibration, objects that move over a table; the last line is JSON.
 
-python -m experiments.tagvision                                    # lines and calibration, a minute
-python -m experiments.tagvision benchmark=planar_tracks            # and the suite, simulated first where missing
-python -m experiments.tagvision benchmark=planar_tracks split=validation out=<folder of experiments.simulate>
+python -m experiments.tagvision                                # lines and calibration, a minute
+python -m experiments.tagvision suite=planar_tracks            # and the suite, simulated first where missing
+python -m experiments.tagvision suite=planar_tracks split=validation paths.recordings_dir=<folder of experiments.simulate>
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-
-from .errors import in_a_line, refuse_dropped_choices
-from .help import answer_help
-from .train import CONFIGS, resolved
+from .command import checked, command, print_result
 
 
-@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="tagvision")
-def main(config: DictConfig) -> None:
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    from tagjax.core.settings import from_mapping
     from tagjax.evaluation.tagvision import TagVisionExperiment, run_tagvision, table
 
-    values = resolved(config)
-    progress = values.pop("progress")
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    console = Console()
-    with in_a_line("tagvision"):
-        refuse_dropped_choices()
-        OmegaConf.save(OmegaConf.create(values), folder / "config.yaml")
-        checked = from_mapping(TagVisionExperiment, values)
-        with console.status("TagVision") as status:
-            metrics = run_tagvision(checked, folder, on_progress=status.update if progress else None)
+    progress, console = values.pop("progress"), Console()
+    config = checked(TagVisionExperiment, values, folder)
+    with console.status("TagVision") as status:
+        metrics = run_tagvision(config, folder, on_progress=status.update if progress else None)
     console.print(Markdown(table(metrics)))
     console.print(f"plots, table.md and metrics.json in {folder}", soft_wrap=True, highlight=False)
-    print(json.dumps(metrics, allow_nan=False))
+    print_result(metrics)
 
 
 if __name__ == "__main__":
-    answer_help(__doc__, "tagvision")
     main()

@@ -76,7 +76,7 @@ def small_walkers():
     from tagjax.sim.record import simulate_recording
     from tagjax.sim.suites import Suite, item_scenario
 
-    settings = yaml.safe_load((Path(__file__).parents[1] / "conf" / "benchmark" / "walkers.yaml").read_text())
+    settings = yaml.safe_load((Path(__file__).parents[1] / "conf" / "suite" / "walkers.yaml").read_text())
     suite = from_mapping(Suite, settings, where="suite").smoke()
     capture = dataclasses.replace(suite.capture, width=160, frame_rate_hz=10.0, flow=True)
     (item,) = suite.items()

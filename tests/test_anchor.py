@@ -7,17 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tagjax.tagattention.anchor import (
-    BIN_M,
-    LEAK,
-    Anchor,
-    joined,
-    log_density,
-    lost_drift_m,
-    move_anchor,
-    update_belief,
-    votes,
-)
+from tagjax.tagattention.anchor import BIN_M, LEAK, Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
 
 NUM_BINS, WINDOW = 60, 5
 WIDTH, UNSEEN = jnp.asarray(0.2), jnp.asarray(-1.0)

@@ -5,14 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tagjax.tagattention.attention import att_corr, att_rbf, attention, centre_first
-from tagjax.tagattention.propagation import (
-    log_likelihood_ratio,
-    propagate,
-    radio_speed,
-    rival_log_odds,
-    soft_clip,
-    velocity_gate,
-)
+from tagjax.tagattention.propagation import log_likelihood_ratio, propagate, radio_speed, rival_log_odds, soft_clip, velocity_gate
 
 RNG = np.random.default_rng(0)
 RHO = jnp.asarray(RNG.normal(size=(4, 3, 5)).astype(np.float32))

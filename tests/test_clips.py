@@ -235,7 +235,7 @@ def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
     assert (heard[3:] > 0.2).all()
     np.testing.assert_array_equal(motion_heard(late, starts, 10, ["tag-b"], [1]), heard[:, 1:])
     assert not motion_heard(late, starts, 10, ["tag-a"], [2]).any()  # never read there
-    drawn = iter(clip_dataset([late], clip_length=10, step=10, seed=0, least_motion=0.1, stride=2))
+    drawn = iter(clip_dataset([late], clip_length=10, step=10, seed=0, min_motion=0.1, stride=2))
     assert {next(drawn).start for _ in range(5)} <= set(starts[1:])
     everything = iter(clip_dataset([late], clip_length=10, step=10, seed=0, stride=2))
     assert {next(everything).start for _ in range(5)} == set(starts)
@@ -243,7 +243,7 @@ def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
     with pytest.raises(
         RecordingError, match=r"In no clip of 10 frames is a tag heard to move by 0\.1 or more \(the most"
     ):
-        clip_dataset([still], clip_length=10, seed=0, least_motion=0.1, stride=2)
+        clip_dataset([still], clip_length=10, seed=0, min_motion=0.1, stride=2)
 
 
 @pytest.mark.ci
@@ -257,25 +257,25 @@ def test_of_many_tags_the_one_that_moves_most_is_kept_and_others_by_chance() -> 
     ]
     both = dataclasses.replace(recording, reads=join_reads([reads, *still]))
     settings = {"clip_length": 10, "step": 10, "seed": 0, "stride": 2}
-    kept = [one.epcs for _, one in zip(range(4), clip_dataset([both], most_tags=3, **settings), strict=False)]
+    kept = [one.epcs for _, one in zip(range(4), clip_dataset([both], max_tags=3, **settings), strict=False)]
     assert {len(epcs) for epcs in kept} == {3}
     assert all({"tag-a", "tag-b"} & set(epcs) for epcs in kept)
     assert len(set(itertools.chain(*kept))) > 4
-    again = [one.epcs for _, one in zip(range(2), clip_dataset([both], most_tags=3, **settings), strict=False)]
+    again = [one.epcs for _, one in zip(range(2), clip_dataset([both], max_tags=3, **settings), strict=False)]
     assert again == kept[:2]
     assert len(next(iter(clip_dataset([both], **settings))).epcs) == 8
     # Antenna 2 is the busiest of all tags, antenna 1 that of the ones that move: whoever is drawn, it is the former.
     elsewhere = [dataclasses.replace(one, antenna=np.full(one.num_reads, 2, np.int16)) for one in still]
     apart = dataclasses.replace(recording, reads=join_reads([reads, *elsewhere]), antennas_m=ANTENNAS_M)
     with pytest.warns(RecordingWarning, match=r"to antenna 2\."):
-        drawn = next(iter(clip_dataset([apart], most_tags=1, least_motion=0.0, **settings)))
+        drawn = next(iter(clip_dataset([apart], max_tags=1, min_motion=0.0, **settings)))
     assert len(drawn.epcs) == 1
     np.testing.assert_allclose(drawn.camera.antennas_m, ANTENNAS_M[1:2], atol=1e-6)
-    assert len(next(iter(clip_dataset([both], most_tags=20, **settings))).epcs) == 8
-    with pytest.raises(ValueError, match="most_tags is 0; expected at least 1 tag"):
-        clip_dataset([both], most_tags=0, **settings)
-    with pytest.raises(ConfigError, match="most_tags is 0; expected at least 1 tag"):
-        ClipSettings(most_tags=0)
+    assert len(next(iter(clip_dataset([both], max_tags=20, **settings))).epcs) == 8
+    with pytest.raises(ValueError, match="max_tags is 0; expected at least 1 tag"):
+        clip_dataset([both], max_tags=0, **settings)
+    with pytest.raises(ConfigError, match="max_tags is 0; expected at least 1 tag"):
+        ClipSettings(max_tags=0)
 
 
 def test_recordings_shorter_than_a_clip_are_named(recording: Recording) -> None:
@@ -286,8 +286,8 @@ def test_recordings_shorter_than_a_clip_are_named(recording: Recording) -> None:
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_no_motion_loses_all_coherence_and_none_less_than_nothing(share: float) -> None:
-    with pytest.raises(ConfigError, match=rf"least_motion is {share}; expected a share of coherence"):
-        ClipSettings(least_motion=share)
+    with pytest.raises(ConfigError, match=rf"min_motion is {share}; expected a loss of coherence"):
+        ClipSettings(min_motion=share)
 
 
 @pytest.mark.parametrize(

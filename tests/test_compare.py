@@ -18,15 +18,8 @@ from omegaconf import OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from experiments.compare import suites_named, with_suites
-from tagjax.baselines.goller import (
-    AntennaModel,
-    Calibration,
-    GollerTracer,
-    make_association,
-    make_location,
-    save_calibration,
-)
+from experiments.suites import suites_named
+from tagjax.baselines.goller import AntennaModel, Calibration, GollerTracer, make_association, make_location, save_calibration
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
 from tagjax.evaluation.compare._run import _score, _Tally
@@ -41,7 +34,7 @@ CONF = Path(__file__).parents[1] / "conf"
 def _config(suites: list[str], **changes: Any) -> CompareConfig:
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         values: Any = OmegaConf.to_container(compose("compare"), resolve=True)
-    for name in ("suites", "progress"):
+    for name in ("paths", "suites", "progress"):
         values.pop(name)
     return dataclasses.replace(from_mapping(CompareConfig, {**values, "suites": suites_named(suites)}), **changes)
 
@@ -82,7 +75,7 @@ def test_no_name_or_figure_is_cut_on_eighty_columns():
     """Of the longest suites and systems there are, with the widest figures that are to be expected."""
     cells = [
         Cell(path.stem, system, 12, 1234, 0.912, 0.934, 123.4, 1234.5, 0.956, 0.978, 1234.5, settings="handheld")
-        for path in (CONF / "benchmark").glob("*.yaml")
+        for path in (CONF / "suite").glob("*.yaml")
         for system in NAMES
     ]
     lines = _printed(console_table(cells)).splitlines()
@@ -93,8 +86,8 @@ def test_no_name_or_figure_is_cut_on_eighty_columns():
 
 
 def test_each_papers_figures_stand_with_its_own_system():
-    papers = _config(["occlusion"]).papers
-    assert set(papers) <= {path.stem for path in (CONF / "benchmark").glob("*.yaml")}
+    papers = _config(["occlusion"]).published
+    assert set(papers) <= {path.stem for path in (CONF / "suite").glob("*.yaml")}
     assert {suite: list(of) for suite, of in papers.items()} == {
         "planar_tracks": ["tagvision"],
         **{f"ceiling_{count}": ["tagview"] for count in range(2, 7)},
@@ -102,8 +95,8 @@ def test_each_papers_figures_stand_with_its_own_system():
         "half_wavelength": ["tagview"],
         "shop_exit": ["goller"],
     }
-    with pytest.raises(ConfigError, match=r"papers: unknown systems blob; expected some of tagattention, .*goller"):
-        _config(["occlusion"], papers={"occlusion": {"blob": "0.9"}})
+    with pytest.raises(ConfigError, match=r"published: unknown systems blob; expected some of tagattention, .*goller"):
+        _config(["occlusion"], published={"occlusion": {"blob": "0.9"}})
 
 
 def test_the_csv_holds_every_field(tmp_path: Path):
@@ -180,22 +173,23 @@ def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPa
     assert Systems(config.systems, config.scores).taken("goller", item) == "starting widths"
     wrong = dataclasses.replace(settings, goller_calibration=str(tmp_path / "none.json"))
     with pytest.raises(ConfigError, match=r"systems\.goller_calibration: .*none\.json.*experiments\.goller"):
-        run_comparison(dataclasses.replace(config, systems=wrong, out=str(tmp_path / "made")), tmp_path / "out")
+        run_comparison(
+            dataclasses.replace(config, systems=wrong, recordings_dir=str(tmp_path / "made")), tmp_path / "out"
+        )
     assert not (tmp_path / "made").exists()
 
 
 def test_what_cannot_be_compared_is_refused():
-    with pytest.raises(SystemExit, match=r"unknown suite nowhere; known are .*planar_tracks"):
+    with pytest.raises(ValueError, match=r"suites: found nowhere; expected some of .*planar_tracks"):
         suites_named(["nowhere"])
-    assert list(suites_named("occlusion")) == ["occlusion"]
-    assert with_suites(["benchmark=[a,b]", "most=2"]) == ["suites=[a,b]", "most=2"]
-    assert with_suites(["benchmark=a,b", "only=[x,y]"]) == ["suites=[a,b]", "only=[x,y]"]
-    assert with_suites(["benchmark=a"]) == ["suites=a"]
-    assert with_suites(["-m", "benchmark=a,b"]) == ["-m", "suites=a,b"]  # a run for each
-    assert with_suites(["benchmark=choice(a,b)"]) == ["suites=choice(a,b)"]
-    with pytest.raises(ConfigError, match="No suite"):
+    assert list(suites_named(["occlusion"])) == ["occlusion"]
+    with pytest.raises(ConfigError, match="suites is empty"):
         _config([])
-    for change, told in (({"only": ("magic",)}, "magic"), ({"split": "exam"}, "exam"), ({"most": 0}, "most")):
+    for change, told in (
+        ({"only": ("magic",)}, "magic"),
+        ({"split": "exam"}, "exam"),
+        ({"max_recordings": 0}, "max_recordings"),
+    ):
         with pytest.raises(ConfigError, match=told):
             _config(["occlusion"], **change)
 
@@ -203,7 +197,7 @@ def test_what_cannot_be_compared_is_refused():
 @pytest.mark.ci
 def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     config = _config(
-        ["planar_tracks"], smoke=True, most=1, out=str(tmp_path / "made"), only=("tagattention_paper", "tagvision", "goller")
+        ["planar_tracks"], smoke=True, max_recordings=1, recordings_dir=str(tmp_path / "made"), only=("tagattention_paper", "tagvision", "goller")
     )  # fmt: skip
     config = dataclasses.replace(config, scores=dataclasses.replace(config.scores, moved_for_s=0.2, min_pixels=2))
     told: list[str] = []
@@ -219,7 +213,7 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
         assert (cell.ms_a_frame or 0) > 0
     written = json.loads((tmp_path / "out" / "table.json").read_text())
     assert [one["system"] for one in written] == ["tagattention_paper", "tagvision", "goller"]
-    assert [one["paper"] for one in written] == [None, config.papers["planar_tracks"]["tagvision"], None]
+    assert [one["paper"] for one in written] == [None, config.published["planar_tracks"]["tagvision"], None]
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()
     assert any("simulated" in line for line in told)
@@ -228,7 +222,13 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
 
 
 def test_a_suite_without_pictures_is_said_to_be_one_and_the_others_go_on(tmp_path: Path):
-    config = _config(["planar_101", "planar_tracks"], smoke=True, most=1, out=str(tmp_path / "made"), only=("goller",))
+    config = _config(
+        ["planar_101", "planar_tracks"],
+        smoke=True,
+        max_recordings=1,
+        recordings_dir=str(tmp_path / "made"),
+        only=("goller",),
+    )
     lines, table = run_comparison(config, tmp_path / "out")
     assert lines.reason == "no pictures: lines only"
     assert table.reason == "location by proximity needs several antennas"

@@ -4,59 +4,63 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import optax
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException
+from composed import CONF, composed, settings
+from hydra.core.plugins import Plugins
+from hydra.errors import ConfigCompositionException, MissingConfigException
+from hydra.plugins.sweeper import Sweeper
 from omegaconf import OmegaConf
 
-from experiments.compare import suites_named
+from experiments.suites import suites_named
 from tagjax.baselines.tagview import MatchSettings
-from tagjax.core.settings import ConfigError, build, from_mapping
+from tagjax.core.build import build
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import SystemSettings
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
 from tagjax.evaluation.run import EvaluateConfig
+from tagjax.evaluation.sweep import SweepConfig
 from tagjax.evaluation.tagview._run import TagviewExperiment
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.sim.suites import PLANAR, Suite
 from tagjax.tagattention import TagAttention
+from tagjax.tagattention.tracer_settings import make_tracer, tracer_clips
 from tagjax.tracing.tracer import AbstractTracer
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_config import TrainFlowConfig
 
-CONF = Path(__file__).parents[1] / "conf"
-
-
-def _compose(name: str, *overrides: str) -> Any:
-    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
-
-
-GROUPS = ("data", "tracer", "optimizer", "objective", "joint", "logger", "experiment", "debug")
+GROUPS = ("data", "tracer", "optimizer", "objective", "joint", "logger", "scores", "experiment", "debug")
+OPTUNA = any("optuna" in plugin.__module__ for plugin in Plugins.instance().discover(Sweeper))  # of the sweep extra
 
 
 def _options(group: str) -> list[str]:
     return [f"{group}={path.stem}" for path in sorted((CONF / group).glob("*.yaml"))]
 
 
-@pytest.mark.parametrize(
-    "override",
-    [option for group in GROUPS for option in _options(group)],
-)
+@pytest.mark.parametrize("override", [option for group in GROUPS for option in _options(group)])
 def test_every_training_configuration_is_valid(override: str) -> None:
-    config = from_mapping(TrainConfig, _compose("train", override))
-    assert isinstance(build(config.tracer), AbstractTracer)
+    if override == "scores=as_trained":
+        pytest.skip("only for evaluations: all values are null")
+    config = settings(TrainConfig, "train", override)
+    assert isinstance(make_tracer(config.tracer), AbstractTracer)
     assert isinstance(build(config.optimizer), optax.GradientTransformation)
-    for settings in config.baselines.values():
-        assert isinstance(build(settings), AbstractTracer)
+    for baseline in config.baselines.values():
+        assert isinstance(make_tracer(baseline), AbstractTracer)
     assert config.objective.weights()
+
+
+@pytest.mark.parametrize("experiment", ["handheld", "handheld_from_people"])
+def test_hand_held_objects_are_learned_on_every_second_pixel(experiment: str) -> None:
+    config = settings(TrainConfig, "train", f"experiment={experiment}")
+    assert config.data.clips.stride == tracer_clips(composed("train", "tracer=tagattention_handheld")["tracer"]).stride
+    assert (config.scores.moved_for_s, config.scores.lock_frames) == (0.0, 10)
 
 
 @pytest.mark.parametrize(
@@ -64,6 +68,7 @@ def test_every_training_configuration_is_valid(override: str) -> None:
     [
         [],
         ["flow=raft_small"],
+        ["recipe=none"],
         ["recipe=fine_tune"],
         ["recipe=raft"],
         ["recipe=student"],
@@ -72,7 +77,7 @@ def test_every_training_configuration_is_valid(override: str) -> None:
     ],
 )
 def test_every_flow_training_configuration_is_valid(overrides: list[str]) -> None:
-    config = from_mapping(TrainFlowConfig, _compose("train_flow", *overrides))
+    config = settings(TrainFlowConfig, "train_flow", *overrides)
     made = jax.eval_shape(lambda: eqx.filter(build(config.flow), eqx.is_array))
     assert isinstance(made, AbstractFlowNetwork)
     for size in (config.data.variation.height, config.data.variation.width, config.data.variation.margin_px):
@@ -81,68 +86,127 @@ def test_every_flow_training_configuration_is_valid(overrides: list[str]) -> Non
 
 
 def test_every_recipe_is_tested() -> None:
-    assert set(_options("recipe")) == {"recipe=fine_tune", "recipe=flownet", "recipe=raft", "recipe=student"}
+    names = {"fine_tune", "flownet", "none", "raft", "student"}
+    assert set(_options("recipe")) == {f"recipe={name}" for name in names}
 
 
 def test_evaluation_configurations_are_valid() -> None:
-    assert from_mapping(EvaluateConfig, _compose("evaluate")).tracer is None
-    named = from_mapping(EvaluateConfig, _compose("evaluate", "tracer=tagattention_paper", "frames=[0,20]"))
-    assert named.tracer is not None
-    assert isinstance(build(named.tracer), AbstractTracer)
-    assert named.frames == (0, 20)
+    assert settings(EvaluateConfig, "evaluate").tracer is None
+    chosen = settings(EvaluateConfig, "evaluate", "tracer=tagattention_paper", "frames=[0,20]", "scores=handheld")
+    assert chosen.tracer is not None
+    assert isinstance(build(chosen.tracer), AbstractTracer)
+    assert chosen.frames == (0, 20)
+    assert chosen.scores["lock_frames"] == 10
+
+
+def test_a_sweep_sees_the_clips_of_its_tracer() -> None:
+    suites = {"suites": suites_named(["velocity_threshold"])}
+    for tracer, stride in (("tagattention_paper", 4), ("tagattention_handheld", 2)):
+        values = composed("sweep_paper", f"tracer={tracer}")
+        values.pop("progress")
+        clips = from_mapping(SweepConfig, {**values, **suites}).clip_settings()
+        assert (clips.stride, clips.estimator) == (stride, "paper")
 
 
 def test_flow_evaluation_configurations_are_valid() -> None:
-    settings = from_mapping(FlowEvaluationSettings, _compose("evaluate_flow"))
-    assert settings.flows
+    assert settings(FlowEvaluationSettings, "evaluate_flow").flows
 
 
 @pytest.mark.parametrize(("name", "schema"), [("goller", GollerConfig), ("tagview", TagviewExperiment)])
-def test_forerunners_configurations_are_valid(name: str, schema: type) -> None:
-    values = _compose(name)
+def test_configurations_of_the_earlier_systems_are_valid(name: str, schema: type) -> None:
+    assert settings(schema, name)
     fields = {field.name for field in dataclasses.fields(schema)}
-    assert from_mapping(schema, {key: value for key, value in values.items() if key in fields})
-    assert set(values) - fields <= {"command", "progress", "training"}
+    assert set(composed(name)) - fields <= {"command", "progress"}
 
 
 def test_the_comparison_takes_each_system_as_its_own_experiments_do() -> None:
-    systems = _compose("compare")["systems"]
-    vision, view = _compose("tagvision"), _compose("tagview")
+    systems = composed("compare")["systems"]
+    vision, view = composed("tagvision"), composed("tagview")
     assert systems["tagvision"] == vision["system"]
     assert systems["tagvision_calibration"] == vision["calibration"]
     assert systems["tagview"] == view["system"]
-    assert systems["goller"] == _compose("goller")["settings"]
-    # What is claimed on the way is one of the settings that are compared on the same tracks.
+    assert systems["goller"] == composed("goller")["settings"]
+    # The system's own matching is among the settings that are compared on the same tracks.
     assert vision["matching"]["adapted"] == vision["system"]["match"]
-    assert view["matching"][view["whole"]] == {name: view["system"][name] for name in ("reads", "match")}
-    whole = from_mapping(MatchSettings, view["system"]["match"])
+    assert view["matching"][view["complete"]] == {name: view["system"][name] for name in ("reads", "match")}
+    complete = from_mapping(MatchSettings, view["system"]["match"])
     for name, change in (("no_rssi", {"mu": 0.0}), ("camera_origin", {"origin": "principal"})):
-        assert from_mapping(MatchSettings, view["matching"][name]["match"]) == dataclasses.replace(whole, **change)
+        assert from_mapping(MatchSettings, view["matching"][name]["match"]) == dataclasses.replace(complete, **change)
     for name, tracer in (("people", "tagattention"), ("handheld", "tagattention_handheld")):
-        assert systems["tagattention"][name]["tracer"] == _compose("train", f"tracer={tracer}")["tracer"]
+        assert systems["tagattention"][name] == composed("train", f"tracer={tracer}")["tracer"]
 
 
 def test_frames_are_scored_alike_everywhere() -> None:
-    scores = [_compose(name)["scores"] for name in ("train", "compare")]
-    assert scores[0] == scores[1]
+    scores = [composed(name)["scores"] for name in ("train", "compare")]
+    assert scores[0] == scores[1] == composed("evaluate", "scores=default")["scores"]
     assert from_mapping(ScoreSettings, scores[0]) == ScoreSettings()
 
 
 def test_every_story_has_tracer_settings_in_the_comparison() -> None:
-    systems = from_mapping(SystemSettings, _compose("compare")["systems"])
-    for path in (CONF / "benchmark").glob("*.yaml"):
-        suite = from_mapping(Suite, suites_named(path.stem)[path.stem])
+    systems = from_mapping(SystemSettings, composed("compare")["systems"])
+    for path in (CONF / "suite").glob("*.yaml"):
+        suite = from_mapping(Suite, suites_named([path.stem])[path.stem])
         stories = {variant.story or suite.story for variant in suite.variants} - {PLANAR}
         assert stories <= set(systems.settings_of), path.stem
     with pytest.raises(ConfigError, match="settings_of names magic"):
         dataclasses.replace(systems, settings_of={"crowd": "magic"})
 
 
-def test_a_misspelt_override_is_refused() -> None:
+@pytest.mark.parametrize(
+    ("command", "override", "known"),
+    [
+        ("simulate", "suite=planar_trcks", "planar_tracks"),
+        ("tagvision", "suite=planar_trcks", "planar_tracks"),
+        ("evaluate", "suite=multi_5", "multi_4"),
+        ("evaluate", "tracer=tagvision", "tagattention_handheld"),
+        ("evaluate", "tracer@baselines.paper=magic", "tagattention_paper"),
+        ("evaluate", "scores=handhold", "handheld"),
+        ("train", "suite=multi_5", "multi_4"),
+        ("train", "experiment=handhold", "handheld"),
+        ("train", "joint=pyramids", "pyramid"),
+        ("train", "debug=on", "default"),
+        ("train", "hparams_search=optun", "optuna"),
+        ("train_flow", "recipe=rafft", "raft"),
+    ],
+)
+def test_a_misspelt_choice_is_refused_with_the_known_ones(command: str, override: str, known: str) -> None:
+    with pytest.raises(MissingConfigException, match=rf"(?s)Available options.*{known}"):
+        composed(command, override)
+
+
+def test_a_misspelt_key_is_refused() -> None:
     with pytest.raises(ConfigCompositionException):
-        _compose("train", "loop.num_step=3")
+        composed("train", "loop.num_step=3")
+
+
+def test_no_group_is_optional() -> None:
+    """Hydra ignores a misspelt choice of an optional group."""
+    assert not [path for path in CONF.rglob("*.yaml") if re.search(r"^\s*- optional", path.read_text(), re.MULTILINE)]
+
+
+def test_recordings_lie_in_one_place() -> None:
+    """`paths.recordings_dir` moves all of them: no other file names the folder."""
+    for path in CONF.rglob("*.yaml"):
+        if path != CONF / "paths" / "default.yaml":
+            assert not re.search(r"^[^#\n]*: *(recordings|outputs)(/|\s|$)", path.read_text(), re.MULTILINE), path
+    assert composed("simulate", "paths.recordings_dir=elsewhere")["recordings_dir"] == "elsewhere"
+    assert composed("train", "paths.recordings_dir=elsewhere")["data"]["simulate"]["folder"] == "elsewhere"
+    assert composed("goller", "paths.recordings_dir=elsewhere")["scenarios"] == "elsewhere/shop_exit"
 
 
 def test_the_tracer_file_names_every_setting() -> None:
-    given = set(_compose("train")["tracer"]) - {"_target_"}
+    given = set(composed("train")["tracer"]) - {"_target_"}
     assert given == set(inspect.signature(TagAttention).parameters)
+
+
+def test_every_file_of_a_group_is_a_choice_of_some_command() -> None:
+    folders = {path.parent.relative_to(CONF).as_posix() for path in CONF.rglob("*.yaml")} - {"."}
+    text = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
+    for folder in folders - {"paths", "hydra"}:
+        assert re.search(rf"^  - (override )?/?{folder}(@[\w.]+)?: ", text, re.MULTILINE), folder
+    assert all("hydra: default" in Path(path).read_text() for path in CONF.glob("*.yaml"))
+
+
+def test_suites_have_the_names_of_their_files() -> None:
+    for path in (CONF / "suite").glob("*.yaml"):
+        assert OmegaConf.load(path).name == path.stem

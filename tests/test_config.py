@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import optax
 import pytest
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax.core.settings import ConfigError, build, changed, from_mapping
+from tagjax.benchmarks.stages import BenchmarkSettings
+from tagjax.core.build import build
+from tagjax.core.settings import ConfigError, changed, from_mapping
+from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.run import EvaluateConfig
+from tagjax.flow.losses import FlowLossSettings
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.recording.opening import VirtualTagSettings
 from tagjax.tracing.clips import ClipSettings
 from tagjax.training.config import TrainConfig
+from tagjax.training.flow_sources import FlowDataSettings
+from tagjax.training.logging import LoggerSettings
 from tagjax.training.loop import LoopSettings
 from tagjax.training.loss import ObjectiveSettings
+from tagjax.training.processes import DistributedSettings
 from tagjax.training.sources import DataSettings
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -47,7 +56,7 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"data": {"clips": {"strid": 3}}}, r"data\.clips: unknown key 'strid'"),
         ({"seed": "one"}, "seed: found 'one'; expected int"),
         ({"seed": True}, "seed: found True"),
-        ({"data": {"recordings": "a.zarr"}}, "expected a list"),
+        ({"data": {"recordings": "a.zarr"}}, "expected a list of str"),
         ({"logger": {"mode": "loud"}}, "expected one of 'disabled', 'offline', 'online'"),
         ({"data": {"clips": {"stride": None}}}, "data.clips.stride: found None"),
         ({"data": 3}, "expected keys and values"),
@@ -60,7 +69,7 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"data": {"virtual_tag": {"seeds": []}}}, r"data\.virtual_tag: seeds is empty; expected at least one"),
         ({"scores": {"tags_at_once": 0}}, r"scores: tags_at_once is 0; expected at least 1"),
         ({"scores": {"frames_at_once": -1}}, r"scores: frames_at_once is -1; expected at least 1"),
-        ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a value from 0 to 1"),
+        ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a share from 0 to 1"),
         ({"scores": {"frames": [9, 3]}}, r"scores: frames is \[9, 3\]; expected \[from, to\]"),
     ],
 )
@@ -76,7 +85,7 @@ def test_missing_keys_and_lengths() -> None:
     with pytest.raises(ConfigError, match="found 3 elements; expected 2"):
         from_mapping(EvaluateConfig, {"frames": [3, 9, 2]})
     with pytest.raises(ConfigError, match="stride is 0; expected at least 1"):
-        from_mapping(EvaluateConfig, {"stride": 0})
+        from_mapping(EvaluateConfig, {"clips": {"stride": 0}})
     assert from_mapping(DataSettings, {}) == DataSettings()
 
 
@@ -95,7 +104,7 @@ def test_build_makes_what_the_target_names() -> None:
         ("tagjaxevil.thing", "starts with tagjax. or optax."),
         ("tagjax.recording.dataclasses.asdict", "can be called"),
         ("tagjax.training.logging.os.system", "can be called"),
-        ("tagjax.core.settings._resolve", "can be called"),
+        ("tagjax.core.build._resolve", "can be called"),
         ("optax.adamm", "can be called"),
         ("tagjax.nothing.here", "can be called"),
         (None, "found None"),
@@ -111,7 +120,7 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
         build({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
 
 
-@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention.paper.TagAttentionPaper"])
+@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention_paper.TagAttentionPaper"])
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -127,44 +136,111 @@ def test_settings_that_no_tracer_can_have_are_named(tracer: str, settings: dict,
         build({"_target_": f"tagjax.{tracer}", **settings}, where="tracer")
 
 
-def _written(path: str) -> dict[str, Any]:
-    """What a file under conf/ says itself, without what it is composed with."""
-    values = OmegaConf.to_container(OmegaConf.load(CONF / path))
-    assert isinstance(values, dict)
-    return {str(key): value for key, value in values.items() if key not in ("defaults", "hydra")}
+def _composed(command: str, *overrides: str) -> Any:
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        return OmegaConf.to_container(compose(command, list(overrides)), resolve=True)
 
 
 @pytest.mark.parametrize(
-    ("path", "section", "schema"),
+    ("command", "overrides", "path", "schema", "changes"),
     [
-        ("objective/coherent.yaml", None, ObjectiveSettings),
-        ("data/default.yaml", None, DataSettings),
-        ("data/default.yaml", "clips", ClipSettings),
-        ("data/default.yaml", "virtual_tag", VirtualTagSettings),
-        ("train.yaml", "scores", ScoreSettings),
-        ("scores/default.yaml", None, ScoreSettings),
-        ("evaluate.yaml", "virtual_tag", VirtualTagSettings),
+        ("train", [], "data", DataSettings, {"clips"}),
+        ("train", [], "objective", ObjectiveSettings, {}),
+        ("train", [], "scores", ScoreSettings, {}),
+        ("train", [], "loop", LoopSettings, {}),
+        ("train", [], "logger", LoggerSettings, {}),
+        ("train", [], "distributed", DistributedSettings, {}),
+        ("train_flow", [], "distributed", DistributedSettings, {}),
+        ("train_flow", [], "data", FlowDataSettings, {"drawn"}),
+        ("train_flow", [], "loss", FlowLossSettings, {"smooth_first"}),
+        ("evaluate", [], "virtual_tag", VirtualTagSettings, {}),
+        ("evaluate_flow", [], "", FlowEvaluationSettings, {"pairs"}),
+        ("benchmark", [], "", BenchmarkSettings, {}),
     ],
 )
-def test_defaults_in_code_are_those_of_the_files(path: str, section: str | None, schema: type) -> None:
-    """A library user who names no value gets what the command line runs with; every field is in the file."""
-    values = _written(path)
-    chosen = values if section is None else values[section]
-    assert set(chosen) == {field.name for field in dataclasses.fields(schema)}
-    assert from_mapping(schema, chosen) == schema()
+def test_defaults_in_code_are_those_of_the_files(
+    command: str, overrides: list[str], path: str, schema: type, changes: set[str]
+) -> None:
+    """YAML is the home; a library user who gives no value gets what the command runs with. `changes` are exceptions."""
+    values = _composed(command, *overrides)
+    chosen = values if not path else values[path]
+    names = {field.name for field in dataclasses.fields(schema)}
+    given = {name: value for name, value in chosen.items() if name in names}
+    assert set(given) == names
+    assert path == "" or set(chosen) == names
+    made, default = from_mapping(schema, given), schema()
+    assert {name for name in names if getattr(made, name) != getattr(default, name)} == set(changes)
 
 
 def test_defaults_of_an_evaluation_are_those_of_the_file() -> None:
-    values = _written("evaluate.yaml")
-    assert from_mapping(EvaluateConfig, {**values, "clips": {}, "scores": {}}) == EvaluateConfig()
+    values = _composed("evaluate")
+    names = {field.name for field in dataclasses.fields(EvaluateConfig)}
+    given = {name: value for name, value in values.items() if name in names}
+    assert from_mapping(EvaluateConfig, {**given, "clips": {}, "scores": {}}) == EvaluateConfig()
     for name, settings in (("clips", ClipSettings()), ("scores", ScoreSettings())):
         assert changed(settings, values[name], where=name) == settings
     assert set(values["scores"]) == {field.name for field in dataclasses.fields(ScoreSettings)}
-    # A training clip's length, motion, tags and workers mean nothing to an evaluation, which has its own epcs.
-    assert set(values["clips"]) == {field.name for field in dataclasses.fields(ClipSettings)} - {
-        "length",
-        "epcs",
-        "least_motion",
-        "most_tags",
-        "workers",
-    }
+    # Of a training clip only: its length, motion, tags and workers. The tags of an evaluation are the key `epcs`.
+    of_training = {"length", "epcs", "min_motion", "max_tags", "workers"}
+    assert set(values["clips"]) == {field.name for field in dataclasses.fields(ClipSettings)} - of_training
+
+
+def test_an_unknown_key_comes_with_the_closest_known_one() -> None:
+    with pytest.raises(ConfigError, match=r"unknown key 'strid'; known keys are stride, .*; did you mean 'stride'\?$"):
+        from_mapping(TrainConfig, {**LEAST, "data": {"clips": {"strid": 3}}})
+
+
+def test_several_unknown_keys_are_named_at_once() -> None:
+    with pytest.raises(ConfigError, match=r"^loop: unknown key 'num_step', 'speed';"):
+        from_mapping(TrainConfig, {**LEAST, "loop": {"num_step": 3, "speed": 1}})
+
+
+@dataclasses.dataclass(frozen=True)
+class _Inner:
+    size: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Outer:
+    """Every kind of field that a schema has."""
+
+    count: int
+    word: str | None = None
+    choice: Literal["all"] | tuple[int, ...] | None = None
+    pair: tuple[float, float] = (0.0, 1.0)
+    inner: tuple[_Inner, ...] = ()
+    named: Mapping[str, _Inner] = dataclasses.field(default_factory=dict)
+    values: Mapping[str, tuple[int | float | str | bool, ...]] = dataclasses.field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"count": "1"}, r"^at\.count: found '1'; expected int"),
+        ({"count": 1.0}, r"^at\.count: found 1\.0; expected int"),
+        ({}, r"^at: no key 'count'; expected one: int"),
+        ({"count": 1, "word": 3}, r"^at\.word: found 3; expected str"),
+        ({"count": 1, "choice": "some"}, r"^at\.choice: found 'some'; expected (?=.*'all')(?=.*list of int).* or null"),
+        ({"count": 1, "pair": [1, 2, 3]}, r"^at\.pair: found 3 elements; expected 2"),
+        ({"count": 1, "pair": [1]}, r"^at\.pair: found 1 elements; expected 2"),
+        ({"count": 1, "pair": [1, "2"]}, r"^at\.pair\[1\]: found '2'; expected float"),
+        ({"count": 1, "inner": [{"size": 1}, {"siez": 2}]}, r"^at\.inner\[1\]: unknown key 'siez'.*mean 'size'"),
+        ({"count": 1, "named": {"a": {"size": True}}}, r"^at\.named\.a\.size: found True; expected float"),
+        ({"count": 1, "named": {"a": 3}}, r"^at\.named\.a: found 3; expected keys and values"),
+        ({"count": 1, "values": {"a": [[1]]}}, r"^at\.values\.a\[0\]: found \[1\]; expected int .* or float"),
+    ],
+)
+def test_the_place_of_a_fault_is_named_at_any_depth(given: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        from_mapping(_Outer, given, where="at")
+
+
+def test_values_keep_their_types() -> None:
+    given = {"count": 2, "choice": [1, 2], "pair": [1, 2.5], "inner": [{"size": 3}]}
+    made = from_mapping(_Outer, {**given, "values": {"a": [1, 0.5, "b", True]}})
+    assert made.choice == (1, 2)
+    assert made.pair == (1.0, 2.5)
+    assert made.inner == (_Inner(3.0),)
+    assert [type(one) for one in (*made.pair, made.inner[0].size)] == [float] * 3
+    assert [type(one) for one in made.values["a"]] == [int, float, str, bool]
+    assert changed(made, {"count": 3, "word": None}, where="") == dataclasses.replace(made, count=3)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override
 from omegaconf import OmegaConf
 
-from experiments.benchmark import with_cases
-from experiments.compare import with_suites
 from tagjax.core.settings import from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.goller import GollerConfig
@@ -36,7 +33,6 @@ SCHEMAS: dict[str, type] = {
     "train": TrainConfig,
     "train_flow": TrainFlowConfig,
 }
-REWORDED: dict[str, Callable[[list[str]], list[str]]] = {"benchmark": with_cases, "compare": with_suites}
 _COMMAND = re.compile(r"python -m experiments\.(\w+)([^`\n]*)")
 
 
@@ -73,8 +69,8 @@ def _one_of(override: Override) -> str:
 @pytest.mark.parametrize(("name", "words"), _documented())
 def test_a_documented_command_composes(name: str, words: tuple[str, ...]) -> None:
     assert (ROOT / "experiments" / f"{name}.py").is_file()
-    plain = [word for word in REWORDED.get(name, list)(list(words)) if not word.startswith("-")]
-    if "search=optuna" in plain:  # its defaults name the sweeper's own
+    plain = [word for word in words if not word.startswith("-")]
+    if "hparams_search=optuna" in plain:  # its defaults name the sweeper's own
         pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs the sweep extra")
     parsed = OverridesParser.create().parse_overrides(plain)
     own = [one for one in parsed if not one.key_or_group.startswith("hydra")]  # launchers need their plugins

@@ -28,7 +28,7 @@ import tagjax.flow
 import tagjax.flow.estimates
 import tagjax.flow.weights
 from tagjax.core.arrays_file import named_arrays
-from tagjax.core.settings import build
+from tagjax.core.build import build
 from tagjax.flow.cache import pair_flow
 from tagjax.flow.estimates import NetworkFlow, agreement, estimate, flow_along, one_way, padding
 from tagjax.flow.losses import occluded

@@ -12,24 +12,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from tagjax.flow._layers import enlarge_flow
-from tagjax.flow.losses import (
-    FlowLossSettings,
-    charbonnier,
-    data_distance,
-    data_term,
-    imitation_term,
-    inconsistency,
-    inside,
-    level_terms,
-    margin_of,
-    occluded,
-    sequence_terms,
-    shown,
-    smoothness,
-    ssim_distance,
-    teaching_term,
-    weighted,
-)
+from tagjax.flow.losses import FlowLossSettings, charbonnier, data_distance, data_term, imitation_term, inconsistency, inside, level_terms, margin_of, occluded, sequence_terms, shown, smoothness, ssim_distance, teaching_term, weighted
 from tagjax.image.census import GREY, census_distance, census_offsets, ternary, to_grey
 
 KINDS = ("census", "photometric", "ssim")

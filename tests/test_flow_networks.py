@@ -19,7 +19,7 @@ from hydra import compose, initialize_config_dir
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
-from tagjax.core.settings import build
+from tagjax.core.build import build
 from tagjax.flow import flownet, raft
 from tagjax.flow._layers import Conv, SeparableConv, convex_upsample, enlarge, enlarge_flow, shrink, space_to_depth
 from tagjax.flow.cost_volume import cost_volume, normalise_features

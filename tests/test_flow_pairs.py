@@ -224,7 +224,7 @@ def test_motion_is_mostly_small_partly_zero_and_sometimes_large():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"height": 8}, "too small"),
+        ({"height": 8}, "at least 16 pixels"),
         ({"num_layers": (0, 3)}, "num_layers"),
         ({"num_layers": (4, 3)}, "num_layers"),
         ({"bend_probability": 1.5}, "bend_probability.*probability"),

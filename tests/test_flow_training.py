@@ -22,15 +22,7 @@ from tagjax.flow.estimates import NetworkFlow
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.flow.named import make_flow
 from tagjax.flow.network import AbstractFlowNetwork
-from tagjax.flow.picture_pairs import (
-    ImageFolder,
-    PairSource,
-    StackedPairs,
-    VariationSettings,
-    open_sequence,
-    pair_dataset,
-    vary,
-)
+from tagjax.flow.picture_pairs import ImageFolder, PairSource, StackedPairs, VariationSettings, open_sequence, pair_dataset, vary
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall
 from tagjax.recording import RecordingError
@@ -51,7 +43,7 @@ SMALL = {
 }
 PLAIN = VariationSettings(
     height=32, width=48, scale=(1.0, 1.0), turn_deg=0.0, gain=0.0, gamma=0.0, tint=0.0, unlike=0.0, noise=0.0,
-    grey_share=0.0,
+    grey_probability=0.0,
 )  # fmt: skip
 
 
@@ -283,7 +275,7 @@ def test_flow_is_cut_as_the_pictures_are() -> None:
     settings = dataclasses.replace(PLAIN, height=64, width=64, margin_px=8, scale=(0.8, 1.2), turn_deg=30.0)
     inner = slice(12, -12), slice(12, -12)
     for seed in range(6):
-        varied = dataclasses.replace(settings, transpose_share=float(seed % 2))
+        varied = dataclasses.replace(settings, transpose_probability=float(seed % 2))
         found = vary(pair, np.random.default_rng(seed), varied, flow)
         assert found["flow_px"].shape == (64, 64, 2)
         assert found["clean"].shape == (2, 80, 80, 3)
@@ -308,12 +300,12 @@ def test_beyond_the_picture_there_is_no_flow() -> None:
 def test_negatives_and_exchanged_colours_are_those() -> None:
     pair = smooth_pictures(2, 64, 80)
     plain = vary(pair, np.random.default_rng(0), PLAIN)
-    negative = vary(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_share=1.0))
+    negative = vary(pair, np.random.default_rng(0), dataclasses.replace(PLAIN, negative_probability=1.0))
     np.testing.assert_array_equal(negative["clean"], plain["clean"])
     np.testing.assert_allclose(negative["seen"].astype(float), 255 - plain["seen"].astype(float), atol=1)
     orders = set()
     for seed in range(8):
-        found = vary(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_share=1.0))
+        found = vary(pair, np.random.default_rng(seed), dataclasses.replace(PLAIN, recolour_probability=1.0))
         order = [
             int(np.argmin([np.abs(found["seen"][..., n].astype(int) - found["clean"][..., k]).sum() for k in range(3)]))
             for n in range(3)
@@ -452,7 +444,7 @@ def test_a_student_learns_what_the_teacher_says() -> None:
         {"gaps": ()},
         {"gaps": (0,)},
         {"height": 8},
-        {"negative_share": 1.5},
+        {"negative_probability": 1.5},
     ],
 )
 def test_impossible_variation_is_refused(change: dict) -> None:

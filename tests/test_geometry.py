@@ -6,17 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tagjax.core.geometry import (
-    backproject,
-    crop_resize,
-    depth_to_range,
-    pixel_rays,
-    project,
-    range_to_depth,
-    register_depth,
-    undistort,
-    undistorted_positions,
-)
+from tagjax.core.geometry import backproject, crop_resize, depth_to_range, pixel_rays, project, range_to_depth, register_depth, undistort, undistorted_positions
 from tagjax.flow.opencv import make_flow
 from tagjax.recording import Intrinsics
 

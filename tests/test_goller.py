@@ -17,38 +17,7 @@ from omegaconf import OmegaConf
 from scipy.stats import binomtest, multivariate_normal
 
 from tagjax.baselines import host_trace
-from tagjax.baselines.goller import (
-    AntennaModel,
-    BlobSettings,
-    BlobTracker,
-    GollerSettings,
-    GollerTracer,
-    Site,
-    antenna_weights,
-    assignment_row,
-    associate,
-    best_threshold,
-    calibrate,
-    carried,
-    covariance_m2,
-    decide,
-    exit_score,
-    find_site,
-    fit_antennas,
-    fit_association,
-    forward_filter,
-    load_calibration,
-    locate,
-    make_association,
-    make_grid,
-    make_location,
-    mixture_likelihood,
-    observe,
-    operating_point,
-    roc_curve,
-    rssi_score,
-    save_calibration,
-)
+from tagjax.baselines.goller import AntennaModel, BlobSettings, BlobTracker, GollerSettings, GollerTracer, Site, antenna_weights, assignment_row, associate, best_threshold, calibrate, carried, covariance_m2, decide, exit_score, find_site, fit_antennas, fit_association, forward_filter, load_calibration, locate, make_association, make_grid, make_location, mixture_likelihood, observe, operating_point, roc_curve, rssi_score, save_calibration
 from tagjax.baselines.goller._antennas import POWER_SCALE_DB, response_db
 from tagjax.baselines.goller._blobs import BlobTracks, in_slots
 from tagjax.baselines.goller._fit import true_states
@@ -56,17 +25,7 @@ from tagjax.baselines.goller._reads import RssiFrames, grid_statistic, rssi_fram
 from tagjax.baselines.goller._site import level_site
 from tagjax.baselines.goller._system import Calibration, empty_picture
 from tagjax.core.settings import from_mapping
-from tagjax.evaluation.goller import (
-    GollerConfig,
-    follow,
-    ladder,
-    mean_curve,
-    outcomes,
-    rates,
-    run_goller,
-    scenario_paths,
-    thresholds,
-)
+from tagjax.evaluation.goller import GollerConfig, follow, ladder, mean_curve, outcomes, rates, run_goller, scenario_paths, thresholds
 from tagjax.evaluation.goller._run import _handover_paths
 from tagjax.evaluation.goller._tables import interval
 from tagjax.recording import Intrinsics, Recording, RecordingError, TagReads, Truth
@@ -1207,7 +1166,8 @@ def test_recordings_that_it_cannot_do_are_named(shop, calibration):
 
 def test_the_configuration_names_every_setting():
     with initialize_config_dir(str(Path(__file__).parents[1].resolve() / "conf"), version_base="1.3"):
-        values: Any = OmegaConf.to_container(compose("goller"))
+        values: Any = OmegaConf.to_container(compose("goller"), resolve=True)
+    values.pop("paths")
     config = from_mapping(GollerConfig, values)
     assert config.settings == GollerSettings()
     names = lambda kind: {field.name for field in dataclasses.fields(kind)}  # noqa: E731
@@ -1224,14 +1184,14 @@ def test_all_that_is_missing_is_named_before_anything_is_observed(tmp_path):
 
     grid, shop = tmp_path / "grid.zarr", tmp_path / "shop_exit"
     config = GollerConfig(grid=str(grid), scenarios=str(shop), handover=str(tmp_path / "nowhere"))
-    with pytest.raises(ValueError, match=r"benchmark=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
+    with pytest.raises(ValueError, match=r"suite=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
         run_goller(config, opened, tmp_path)
     grid.mkdir()
     for split in ("train", "validation", "test"):
         with pytest.raises(ValueError, match=rf"shop_exit: no recording in .*{split}/"):
             run_goller(dataclasses.replace(config, handover=None), opened, tmp_path)
         (shop / split / f"shop_exit-sp_st-{split}-0.zarr").mkdir(parents=True)
-    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate benchmark=shop_handover`"):
+    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate suite=shop_handover`"):
         run_goller(config, opened, tmp_path)
     # Where none is named those beside the scenarios are taken, if there are any.
     default = dataclasses.replace(config, handover=None)

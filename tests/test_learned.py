@@ -14,12 +14,22 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from tagjax.core.settings import ConfigError
 from tagjax.tagattention import TagAttention, learned
-from tagjax.tagattention.learned import load_parameters, packaged_parameters, save_parameters
-from tagjax.training.run import make_tracer
+from tagjax.tagattention.learned import load_parameters, packaged_parameters, read_learned, save_parameters
+from tagjax.tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from tagjax.tracing.clips import ClipSettings
 
 CONF = str((Path(__file__).parents[1] / "conf").resolve())
 SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+CLIPS: dict[str, Any] = {
+    "stride": 2,
+    "window": 3,
+    "flow": "dis",
+    "estimator": "robust",
+    "antennas": None,
+    "max_reads": 16,
+}
 
 
 def _stirred(seed: int = 0) -> TagAttention:
@@ -30,7 +40,7 @@ def _stirred(seed: int = 0) -> TagAttention:
 
 def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     stirred = _stirred()
-    save_parameters(tmp_path / "weights.json", stirred, SETTINGS, {"seed": 3})
+    save_parameters(tmp_path / "weights.json", stirred, SETTINGS, CLIPS, {"seed": 3})
     back = make_tracer(SETTINGS, str(tmp_path / "weights.json"))
     assert isinstance(back, TagAttention)
     assert jax.tree.structure(back) == jax.tree.structure(stirred)
@@ -41,22 +51,22 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
 
 def test_default_is_what_was_learned_from_these_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learned, "PACKAGED", tmp_path)
-    save_parameters(tmp_path / "one.json", _stirred(1), SETTINGS)
-    save_parameters(tmp_path / "two.json", _stirred(2), {**SETTINGS, "beta": 0.5})
+    save_parameters(tmp_path / "one.json", _stirred(1), SETTINGS, CLIPS)
+    save_parameters(tmp_path / "two.json", _stirred(2), {**SETTINGS, "beta": 0.5}, CLIPS)
     assert packaged_parameters() == ("one", "two")
     tracer = TagAttention(cell=4)
     for name, settings in (("one", SETTINGS), ("two", {**SETTINGS, "beta": 0.5})):
         chosen, named = (load_parameters(tracer, source, settings) for source in ("default", name))
         assert chosen.physical() == named.physical()
-    with pytest.raises(ValueError, match=r"No packaged parameters were learned from these settings.*one, two"):
+    with pytest.raises(ValueError, match=r"no packaged parameters were learned from these settings.*one, two"):
         load_parameters(tracer, "default", {**SETTINGS, "cell": 9})
 
 
 def test_settings_that_learned_parameters_replace_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "one.json"
-    save_parameters(path, _stirred(1), SETTINGS)
+    save_parameters(path, _stirred(1), SETTINGS, CLIPS)
     tracer = TagAttention(cell=4)
-    with pytest.raises(ValueError, match=r"learned from beta=0.8.* but beta=0.5 is asked for"):
+    with pytest.raises(ValueError, match=r"found tracer\.beta=0\.5; expected 0\.8"):
         load_parameters(tracer, path, {**SETTINGS, "beta": 0.5})
     load_parameters(tracer, path, {**SETTINGS, "cell": 9, "max_speed_m_s": 2.0})  # which are not learned
 
@@ -83,16 +93,14 @@ def test_what_did_not_move_in_learning_may_be_asked_for(weights: str) -> None:
     told = with_doubt.physical()
     assert told.pop("rest_doubt") == pytest.approx(0.2)
     assert told == {name: value for name, value in without.physical().items() if name != "rest_doubt"}
-    with pytest.raises(
-        ValueError, match=r"things_in_hand\.json: learned from rest_doubt=0\.0.* but rest_doubt=0\.2 is asked for"
-    ):
+    with pytest.raises(ValueError, match=r"things_in_hand\.json: found tracer\.rest_doubt=0\.2; expected 0\.0"):
         make_tracer(doubting, "things_in_hand")  # which learned it
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     tracer = TagAttention(cell=4)
     path = tmp_path / "weights.json"
-    save_parameters(path, tracer, SETTINGS)
+    save_parameters(path, tracer, SETTINGS, CLIPS)
     good = tracer.physical()
 
     def load(**changes: Any) -> None:
@@ -100,7 +108,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(ValueError, match="no learned parameters"):
         load(format="another")
-    with pytest.raises(ValueError, match="version 7; this release reads 1"):
+    with pytest.raises(ValueError, match="version 7; this release reads 2"):
         load(version=7)
     with pytest.raises(ValueError, match="beta: not a finite number"):
         load(parameters={**good, "beta": None})
@@ -137,3 +145,48 @@ def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:
     assert told[0] != told[1] != told[2] != told[0]
     assert isinstance(people, TagAttention)
     assert people.physical() == told[1]
+
+
+def _tracer_settings(name: str) -> dict[str, Any]:
+    with initialize_config_dir(CONF, version_base="1.3"):
+        composed = OmegaConf.to_container(compose("train", [f"tracer={name}"]).tracer, resolve=True)
+    assert isinstance(composed, dict)
+    return {str(key): value for key, value in composed.items()}
+
+
+@pytest.mark.parametrize("weights", ["default", "tagattention", "things_in_hand"])
+def test_packaged_parameters_need_no_further_setting(weights: str) -> None:
+    """They bring their tracer and the clips that it was trained with: every second pixel."""
+    tracer, clips = learned_tracer(weights)
+    settings = _tracer_settings("tagattention")
+    named, same_clips = learned_tracer(weights, settings)
+    assert isinstance(tracer, TagAttention)
+    assert isinstance(named, TagAttention)
+    assert tracer.physical() == named.physical() == make_tracer(settings, weights).physical()
+    assert clips == same_clips == ClipSettings(stride=2)
+    assert ClipSettings().stride == 4  # without weights
+
+
+def test_clip_settings_come_back_without_the_sizes_of_buffers(tmp_path: Path) -> None:
+    save_parameters(tmp_path / "weights.json", _stirred(), SETTINGS, CLIPS)
+    assert learned_tracer(str(tmp_path / "weights.json"))[1] == ClipSettings(stride=2, window=3)
+    kept = read_learned(tmp_path / "weights.json").clips
+    assert kept == {name: value for name, value in CLIPS.items() if name != "max_reads"}
+
+
+def test_a_flow_beside_the_weights_moves_with_them(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    (first / "flow.npz").write_bytes(b"")
+    save_parameters(first / "weights.json", _stirred(), SETTINGS, {**CLIPS, "flow": str(first / "flow.npz")})
+    first.rename(second)
+    assert learned_tracer(str(second / "weights.json"))[1].flow == str(second / "flow.npz")
+
+
+def test_a_tracer_configuration_brings_its_clips() -> None:
+    settings = _tracer_settings("tagattention_handheld")
+    assert tracer_clips(settings) == ClipSettings(stride=2)
+    assert tracer_clips(_tracer_settings("tagattention")) == ClipSettings()
+    assert isinstance(make_tracer(settings), TagAttention)
+    with pytest.raises(ConfigError, match=r"tracer\.clips: unknown key 'strid'"):
+        tracer_clips({**settings, "clips": {"strid": 2}})

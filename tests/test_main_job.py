@@ -24,10 +24,11 @@ from tagjax.recording.reads import join_reads
 from tagjax.recording.store import save_recording
 from tagjax.tagattention import TagAttention
 from tagjax.tagattention.paper import TagAttentionPaper
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.training import run as run_module
 from tagjax.training.config import TrainConfig
 from tagjax.training.loop import Trained
-from tagjax.training.run import antennas_for, make_tracer, run_training
+from tagjax.training.run import antennas_for, run_training
 from tagjax.training.state import TrainState
 
 ROOT = Path(__file__).parents[1]
@@ -120,9 +121,9 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
 
 def test_what_a_run_says_of_itself_is_not_given_again() -> None:
     for more in ({"tracer": {"_target_": "tagjax.tagattention.TagAttention"}}, {"weights": "default"}):
-        with pytest.raises(ConfigError, match="has a tracer and parameters of its own: leave out"):
+        with pytest.raises(ConfigError, match="expected one of them, because a run has its own tracer"):
             from_mapping(EvaluateConfig, {"run": "runs/1", **more})
-    with pytest.raises(ConfigError, match="checkpoint=3 is one of a run's"):
+    with pytest.raises(ConfigError, match="found checkpoint=3 without run"):
         from_mapping(EvaluateConfig, {"checkpoint": 3})
     with pytest.raises(ConfigError, match="clips: unknown key 'strid'"):
         from_mapping(EvaluateConfig, {"clips": {"strid": 3}})
@@ -187,7 +188,7 @@ def test_label_pictures_are_whole_and_of_the_frames_size(tmp_path: Path) -> None
     np.testing.assert_array_equal(labelled.truth.labels[:], recording.truth.labels[:])
 
     odd = dataclasses.replace(settings, reader={"foo": 1})
-    with pytest.raises(ConfigError, match=r"virtual_tag\.reader: unknown key 'foo'; known are region, num_tags"):
+    with pytest.raises(ConfigError, match=r"virtual_tag\.reader: unknown key 'foo'; known keys are region, num_tags"):
         with_virtual_tags(dataclasses.replace(recording, truth=None), odd)
 
     second = tmp_path / "00000001.png"

@@ -24,14 +24,7 @@ from tagjax.radio.refine import interpolation_weights
 from tagjax.radio.unwrap import remove_jump, unwrap_paper
 from tagjax.recording import TagReads
 from tagjax.tracing.motion_evidence import MIN_READS
-from tagjax.tracing.range_windows import (
-    paper_windows,
-    phase_reads,
-    radio_model,
-    radio_windows,
-    robust_windows,
-    window_reads,
-)
+from tagjax.tracing.range_windows import paper_windows, phase_reads, radio_model, radio_windows, robust_windows, window_reads
 
 # Compiled whole: operation by operation they take several times as long to compile.
 refine_path = eqx.filter_jit(refine.refine_path)

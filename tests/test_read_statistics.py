@@ -23,7 +23,7 @@ from tagjax.sim.world.bodies import STEP_S, tag_path
 pytestmark = pytest.mark.ci
 
 C = 299_792_458.0
-FOLDER = Path(__file__).parents[1] / "conf" / "benchmark"
+FOLDER = Path(__file__).parents[1] / "conf" / "suite"
 STATIONARY_S = 20.0
 QUIET = {"outages_per_minute": 0.0}
 

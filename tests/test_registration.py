@@ -241,5 +241,5 @@ def test_a_real_residual_is_mended_in_held_out_frames(real_data, name, step) -> 
 
 
 def test_an_unknown_key_of_the_virtual_reader_is_told_before_anything_is_read():
-    with pytest.raises(ConfigError, match="reader: unknown key 'foo'; known are region, num_tags"):
+    with pytest.raises(ConfigError, match="reader: unknown key 'foo'; known keys are region, num_tags"):
         from_mapping(ImportSettings, {"video": "gone", "reader": {"foo": 1}})

@@ -17,7 +17,7 @@ import synthetic_clips as synthetic
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from experiments.compare import suites_named
+from experiments.suites import suites_named
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.reproduce import measure as measuring
 from tagjax.evaluation.reproduce.interval import ratio_estimate

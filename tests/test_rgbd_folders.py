@@ -10,15 +10,7 @@ import scipy.io
 
 from tagjax.core.geometry import undistort
 from tagjax.recording import Intrinsics, RecordingError
-from tagjax.recording.importers.rgbd_folder import (
-    TUM_INTRINSICS,
-    import_jpg_mat,
-    import_tum,
-    load_calibration,
-    read_colour,
-    read_labels,
-    read_mat_depth,
-)
+from tagjax.recording.importers.rgbd_folder import TUM_INTRINSICS, import_jpg_mat, import_tum, load_calibration, read_colour, read_labels, read_mat_depth
 from tagjax.recording.store import open_recording, save_recording
 
 HEIGHT, WIDTH = 48, 64

@@ -1,4 +1,4 @@
-"""Benchmark suites: every file under conf/benchmark is one, splits are apart, and runs resume and repeat exactly."""
+"""Suites: every file under conf/suite is one, splits are apart, and runs resume and repeat exactly."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tagjax.sim.suites import MANIFEST, PLANAR, SPLITS, Counts, Suite, Variant, 
 from tagjax.sim.world.bodies import STEP_S, tag_dipole, tag_path
 from tagjax.sim.world.objects import bounds
 
-FILES = sorted((Path(__file__).parents[1] / "conf" / "benchmark").glob("*.yaml"))
+FILES = sorted((Path(__file__).parents[1] / "conf" / "suite").glob("*.yaml"))
 
 
 def _suite(path: Path) -> Suite:
@@ -445,7 +445,7 @@ def test_a_folder_with_other_contents_is_left_unchanged(tmp_path):
     home = tmp_path / "tiny"
     home.mkdir()
     (home / "thesis.txt").write_text("precious")
-    with pytest.raises(RecordingError, match="holds something else"):
+    with pytest.raises(RecordingError, match="has no readable suite.json"):
         make_suite(_tiny(), tmp_path)
     assert [path.name for path in home.iterdir()] == ["thesis.txt"]
     (home / "thesis.txt").unlink()
@@ -469,15 +469,15 @@ def test_counts_of_a_suite_may_grow(tmp_path):
 
 def test_impossible_suites_are_refused():
     given = {"name": "x", "about": "x", "paper": "x", "story": "juggle", "seed": 1}
-    with pytest.raises(ConfigError, match="unknown story 'juggle'"):
+    with pytest.raises(ConfigError, match="story is 'juggle'"):
         from_mapping(Suite, given)
     with pytest.raises(ConfigError, match="duration_s is 0"):
         from_mapping(Suite, {**given, "story": "handheld", "duration_s": 0.0})
     with pytest.raises(ConfigError, match="smoke_s 0"):
         from_mapping(Suite, {**given, "story": "handheld", "smoke_s": 0.0})
-    with pytest.raises(ConfigError, match="unknown reader setting volume; known are clock_drift_ppm"):
+    with pytest.raises(ConfigError, match="unknown reader setting volume; expected settings among clock_drift_ppm"):
         from_mapping(Suite, {**given, "story": "handheld", "reader": {"volume": 3}})
-    with pytest.raises(ConfigError, match="unknown story 'juggle'"):
+    with pytest.raises(ConfigError, match="story is 'juggle'"):
         from_mapping(Suite, {**given, "story": "handheld", "variants": [{"name": "a", "story": "juggle"}]})
     with pytest.raises(ConfigError, match="unknown key 'durations'"):
         from_mapping(Suite, {**given, "durations": 3})

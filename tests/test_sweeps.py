@@ -21,10 +21,10 @@ import pytest
 import synthetic_clips as synthetic
 
 from tagjax.core.settings import ConfigError, from_mapping
-from tagjax.evaluation.sweep import Line, SweepConfig, read_lines, run_sweep, said, table, write_sweep
+from tagjax.evaluation.sweep import Line, SweepConfig, point_name, read_lines, run_sweep, table, write_sweep
 from tagjax.tagattention import TagAttention
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.training.logging import Logger, LoggerSettings
-from tagjax.training.run import make_tracer
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.usefixtures("compiled_once")
@@ -53,7 +53,7 @@ def _run(command: list[str]) -> str:
 def _evaluate(recordings: list[str], sweep: Path, *more: str) -> list[str]:
     return [
         *(sys.executable, "-m", "experiments.evaluate", "-m", "tracer=tagattention_paper", "progress=false"),
-        *(f"recordings=[{recordings[0]}]", "stride=4", "frames=[0,8]", "tracer.cell=4", "scores.num_pictures=1"),
+        *(f"recordings=[{recordings[0]}]", "clips.stride=4", "frames=[0,8]", "tracer.cell=4", "scores.num_pictures=1"),
         *("tracer.v0_m_s=0.01,0.1", f"hydra.sweep.dir={sweep}", *more),
     ]
 
@@ -110,7 +110,7 @@ def _states(storage: Path) -> list[tuple[int, str]]:
 def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) -> None:
     storage = tmp_path / "optuna.db"
     command = [
-        *(sys.executable, "-m", "experiments.train", "-m", "search=optuna", "logger=disabled"),
+        *(sys.executable, "-m", "experiments.train", "-m", "hparams_search=optuna", "logger=disabled"),
         *(f"data.recordings=[{recordings[0]}]", f"data.validation=[{recordings[1]}]", "tracer=tagattention_paper"),
         *("data.clips.stride=4", "data.clips.length=8", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),
         *("loop.num_steps=1", "loop.checkpoint_every=1", "loop.validate_every=1", "loop.progress=false"),
@@ -142,13 +142,13 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
 def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
     import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
 
-    from experiments.search import trials_left
+    from experiments.hparams_search import trials_left
 
     storage, folder = f"sqlite:///{tmp_path / 'new' / 'optuna.db'}", tmp_path / "sweep"
     assert trials_left(3, storage, "one", str(folder)) == 3
     study = optuna.create_study(study_name="one", storage=storage)
-    study.build_scenario(study.ask(), 0.5)
-    study.build_scenario(study.ask(), state=optuna.trial.TrialState.FAIL)
+    study.tell(study.ask(), 0.5)
+    study.tell(study.ask(), state=optuna.trial.TrialState.FAIL)
     study.ask()  # killed
     assert trials_left(3, storage, "one", str(folder)) == 2
     assert trials_left(3, storage, "other", str(folder)) == 3
@@ -164,11 +164,12 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 
-from experiments.search import told
-from experiments.train import CONFIGS
+from experiments.command import CONF
+from experiments.hparams_search import sweep_score
+from experiments import train  # registers the resolver of the search
 
 
-@hydra.main(version_base="1.3", config_path=CONFIGS, config_name="train")
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 def main(config):
     folder = Path(HydraConfig.get().runtime.output_dir)
     value = folder / "value"  # a run that is gone on with keeps its own
@@ -177,7 +178,7 @@ def main(config):
     ended = os.environ.get("ENDED")
     if ended == "stopped":
         (folder / "checkpoints" / "2").mkdir(parents=True)
-    return told(float("nan") if ended else float(value.read_text()), folder, 4)
+    return sweep_score(float("nan") if ended else float(value.read_text()), folder, 4)
 
 
 main()
@@ -200,7 +201,7 @@ def _sweep_objective(folder: Path, *more: str, ended: str = "") -> subprocess.Co
 @_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
 def test_a_search_s_trials_have_folders_of_their_own_and_may_fail(tmp_path: Path, launcher: list[str]) -> None:
     storage = tmp_path / "optuna.db"
-    search = ["search=optuna", f"hydra.sweeper.storage=sqlite:///{storage}", *launcher]
+    search = ["hparams_search=optuna", f"hydra.sweeper.storage=sqlite:///{storage}", *launcher]
     assert _sweep_objective(tmp_path, *search, "num_trials=1").returncode == 0
     failed = _sweep_objective(tmp_path, *search, "num_trials=2", ended="nan")
     assert failed.returncode == 0, failed.stderr[-2000:]
@@ -228,7 +229,7 @@ def test_a_stopped_run_ends_its_sweep(tmp_path: Path) -> None:
 @_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
 def test_a_search_without_held_out_recordings_is_refused(tmp_path: Path) -> None:
     storage = f"hydra.sweeper.storage=sqlite:///{tmp_path / 'optuna.db'}"
-    refused = _sweep_objective(tmp_path, "search=optuna", storage, "data.recordings=[a.zarr]")
+    refused = _sweep_objective(tmp_path, "hparams_search=optuna", storage, "data.recordings=[a.zarr]")
     assert refused.returncode == 1
     assert refused.stderr.rstrip().endswith("Name held-out recordings: data.validation=[...].")
     assert not (tmp_path / "sweep").exists()
@@ -241,7 +242,7 @@ SUITE = {
     "story": "handheld",
     "seed": 1,
     "duration_s": 3.0,
-    "settings": {"stationary_s": 0.4},
+    "settings": {"still_s": 0.4},
     "counts": {"train": 0, "validation": 0, "test": 1},
     "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
 }
@@ -250,7 +251,13 @@ PAPER = {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "
 
 def _config(folder: Path, **settings) -> SweepConfig:
     return SweepConfig(
-        **{"suites": {"tiny": SUITE}, "tracer": PAPER, "grid": {"v0_m_s": (0.01, 0.5)}, "out": str(folder), **settings}
+        **{
+            "suites": {"tiny": SUITE},
+            "tracer": PAPER,
+            "grid": {"v0_m_s": (0.01, 0.5)},
+            "recordings_dir": str(folder),
+            **settings,
+        }
     )
 
 
@@ -280,7 +287,7 @@ def test_a_grid_is_swept_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def _line(point: dict, condition: str, iou: float, num_frames: int, curve: tuple = (0.0, 1.0)) -> Line:
     numbers = {"iou": iou, "num_frames": num_frames, "locked": 1.0}
-    return Line(said(point) + condition + str(iou), condition, "one", point, numbers, curve)
+    return Line(point_name(point) + condition + str(iou), condition, "one", point, numbers, curve)
 
 
 def test_a_table_weighs_frames_within_and_conditions_alike(tmp_path: Path) -> None:
@@ -303,14 +310,14 @@ def test_a_table_weighs_frames_within_and_conditions_alike(tmp_path: Path) -> No
 
 
 def test_whole_numbers_and_words_of_a_grid_stay_what_they_are(tmp_path: Path) -> None:
-    values = {"suites": {"tiny": SUITE}, "out": str(tmp_path)}
+    values = {"suites": {"tiny": SUITE}, "recordings_dir": str(tmp_path)}
     tracer = {"_target_": "tagjax.tagattention.TagAttention", "cell": 6, "cut_rule": "margin", "v0_m_s": 0.1}
     tracer["doubled_angle"] = True
     grid = {"cell": [4, 8], "cut_rule": ["margin", "cdf_corner"], "v0_m_s": [0.5], "doubled_angle": [False]}
     config = from_mapping(SweepConfig, {**values, "tracer": tracer, "grid": grid})
     first = config.points()[0]
     assert [type(value) for value in first.values()] == [int, str, float, bool]
-    assert said(first) == "cell=4, cut_rule=margin, v0_m_s=0.5, doubled_angle=False"
+    assert point_name(first) == "cell=4, cut_rule=margin, v0_m_s=0.5, doubled_angle=False"
     for point in config.points():
         assert isinstance(make_tracer({**config.tracer, **point}), TagAttention)
     lines = [_line(point, "slow", 0.1 * number, 10) for number, point in enumerate(config.points())]
@@ -337,11 +344,11 @@ def test_lines_cut_short_are_taken_away(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"suites": {}}, "No suite"),
+        ({"suites": {}}, "suites is empty"),
         ({"grid": {}}, "grid is empty"),
         ({"grid": {"v0_m_s": ()}}, "grid is empty"),
-        ({"grid": {"gamma": (1.0,)}}, "has no gamma; it has alpha_m2, cell, v0_m_s"),
-        ({"splits": ("exam",)}, "Unknown splits exam"),
+        ({"grid": {"gamma": (1.0,)}}, "found gamma; expected parameters of the tracer, some of alpha_m2, cell, v0_m_s"),
+        ({"splits": ("exam",)}, "splits: found exam; expected some of train"),
     ],
 )
 def test_sweeps_of_nothing_are_refused(tmp_path: Path, settings: dict, message: str) -> None:

@@ -11,33 +11,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.stats import norm
 
-from tagjax.baselines.tagview import (
-    SLOPE_OUTLIER_NATS,
-    Coefficient,
-    Heard,
-    MatchSettings,
-    ReadSettings,
-    TagSequences,
-    Traces,
-    agreement,
-    cliques,
-    edge_agreement,
-    fit_line,
-    fit_pairs,
-    hear,
-    identify,
-    interpolate,
-    keep_edges,
-    likelihood_weight,
-    match_graph,
-    pieces,
-    select_edges,
-    shared_coefficient,
-    shared_times,
-    slope_log_odds,
-    splice_phase,
-    translating_factor,
-)
+from tagjax.baselines.tagview import SLOPE_OUTLIER_NATS, Coefficient, Heard, MatchSettings, ReadSettings, TagSequences, Traces, agreement, cliques, edge_agreement, fit_line, fit_pairs, hear, identify, interpolate, keep_edges, likelihood_weight, match_graph, pieces, select_edges, shared_coefficient, shared_times, slope_log_odds, splice_phase, translating_factor
 from tagjax.recording import TagReads
 
 WAVELENGTH_M = 0.3276

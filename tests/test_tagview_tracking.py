@@ -13,33 +13,7 @@ import numpy as np
 import pytest
 
 from tagjax.baselines import HostCamera, HostFrame, host_trace
-from tagjax.baselines.tagview import (
-    AbstractDetector,
-    BoxDetector,
-    BoxNetwork,
-    BoxTracks,
-    DetectorSettings,
-    LabelledFrame,
-    MatchSettings,
-    MotionDetector,
-    SortSettings,
-    TagviewSettings,
-    TagviewTracer,
-    TrainSettings,
-    detection_loss,
-    from_inclusive,
-    labelled_frames,
-    load_detector,
-    make_detector,
-    measure_detector,
-    middle_px,
-    overlap,
-    save_detector,
-    suppress,
-    track_boxes,
-    train_detector,
-    undistorted,
-)
+from tagjax.baselines.tagview import AbstractDetector, BoxDetector, BoxNetwork, BoxTracks, DetectorSettings, LabelledFrame, MatchSettings, MotionDetector, SortSettings, TagviewSettings, TagviewTracer, TrainSettings, detection_loss, from_inclusive, labelled_frames, load_detector, make_detector, measure_detector, middle_px, overlap, save_detector, suppress, track_boxes, train_detector, undistorted
 from tagjax.baselines.tagview._anchors import decode, default_boxes, encode, targets
 from tagjax.evaluation.tagview import Matching, TagviewExperiment, run_tagview, table, true_stretches, watch
 from tagjax.evaluation.tagview._judge import owners
@@ -482,7 +456,7 @@ def test_a_run_writes_its_report(tmp_path, monkeypatch):
     monkeypatch.setattr("tagjax.baselines.tagview._tracer.make_detector", lambda settings: Perfect())
     match = MatchSettings(origin="antenna", least_spread=0.1)
     config = TagviewExperiment(
-        recordings=str(tmp_path / "rec"),
+        recordings_dir=str(tmp_path / "rec"),
         suites=("ceiling_2",),
         matching={"tagview": Matching(match), "alone": Matching(dataclasses.replace(match, programme=False))},
     )
@@ -497,7 +471,7 @@ def test_a_run_writes_its_report(tmp_path, monkeypatch):
         assert (tmp_path / "out" / name).stat().st_size > 0
     with pytest.raises(ValueError, match="no recording"):
         run_tagview(dataclasses.replace(config, suites=("ceiling_9",)), tmp_path / "none")
-    with pytest.raises(ValueError, match="whole"):
+    with pytest.raises(ValueError, match="complete"):
         TagviewExperiment(suites=("a",), matching={})
 
 

@@ -15,26 +15,7 @@ import tagvision_scenes as scenes
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tagjax.baselines.tagvision import (
-    BlobSettings,
-    Board,
-    CalibrateSettings,
-    MatchSettings,
-    Snapshots,
-    TagVisionSettings,
-    TrackSettings,
-    draw_snapshots,
-    heading,
-    hop_slope,
-    match_scores,
-    match_tags,
-    nearest_reads,
-    pair_interpolated,
-    pair_nearest,
-    phase_score,
-    residuals_rad,
-    theory_rad,
-)
+from tagjax.baselines.tagvision import BlobSettings, Board, CalibrateSettings, MatchSettings, Snapshots, TagVisionSettings, TrackSettings, draw_snapshots, heading, hop_slope, match_scores, match_tags, nearest_reads, pair_interpolated, pair_nearest, phase_score, residuals_rad, theory_rad
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.tagvision import LineSettings, TagVisionExperiment, line_scores, run_tagvision
 
@@ -395,11 +376,13 @@ def test_settings_are_checked() -> None:
 
 def _compose(name: str, *overrides: str) -> dict:
     with initialize_config_dir(str((ROOT / "conf").resolve()), version_base="1.3"):
-        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)  # type: ignore[return-value]
+        values = OmegaConf.to_container(compose(name, list(overrides)), resolve=True)
+    assert isinstance(values, dict)
+    return {key: value for key, value in values.items() if key != "paths"}
 
 
 def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
-    values = _compose("tagvision", "benchmark=planar_tracks")
+    values = _compose("tagvision", "suite=planar_tracks")
     values.pop("progress")
     config = from_mapping(TagVisionExperiment, values)
     assert config.system.match == config.matching["adapted"]
@@ -407,7 +390,7 @@ def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
     assert config.system.blobs == BlobSettings()
     assert config.system.tracks == TrackSettings()
     assert from_mapping(CalibrateSettings, _compose("calibrate_camera", "pictures=here")).board == Board()
-    lines = dataclasses.replace(config, benchmark=None, num_calibrations=1, lines=config.lines[:2])
+    lines = dataclasses.replace(config, suite=None, num_calibrations=1, lines=config.lines[:2])
     metrics = run_tagvision(lines, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == json.loads(json.dumps(metrics))
     assert set(metrics["lines"]) == {"stated", "stated with unknown offset"}
@@ -418,9 +401,9 @@ def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
 
 
 def test_a_suite_of_lines_has_nothing_that_moves_over_a_table(tmp_path: Path) -> None:
-    values = _compose("tagvision", "benchmark=planar_101", f"out={tmp_path / 'recordings'}")
+    values = _compose("tagvision", "suite=planar_101", f"recordings_dir={tmp_path / 'recordings'}")
     values.pop("progress")
-    with pytest.raises(ConfigError, match=r"planar_101 has no pictures.*benchmark=planar_tracks"):
+    with pytest.raises(ConfigError, match=r"planar_101 has no pictures.*suite=planar_tracks"):
         run_tagvision(from_mapping(TagVisionExperiment, values), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
@@ -429,11 +412,11 @@ def test_a_suite_of_lines_has_nothing_that_moves_over_a_table(tmp_path: Path) ->
 @pytest.mark.slow
 def test_planar_tracks_run_whole(tmp_path: Path) -> None:
     values = _compose(
-        "tagvision", "benchmark=planar_tracks", "benchmark.duration_s=4.0", "benchmark.counts.test=1", "num_calibrations=1",
-        f"out={tmp_path / 'recordings'}",
+        "tagvision", "suite=planar_tracks", "suite.duration_s=4.0", "suite.counts.test=1", "num_calibrations=1",
+        f"recordings_dir={tmp_path / 'recordings'}",
     )  # fmt: skip
-    values["benchmark"]["counts"] |= {"train": 0, "validation": 0}
-    values["benchmark"]["variants"] = [one for one in values["benchmark"]["variants"] if one["name"] == "three"]
+    values["suite"]["counts"] |= {"train": 0, "validation": 0}
+    values["suite"]["variants"] = [one for one in values["suite"]["variants"] if one["name"] == "three"]
     values.pop("progress")
     metrics = run_tagvision(from_mapping(TagVisionExperiment, values), tmp_path / "run")
     tracks = metrics["tracks"]

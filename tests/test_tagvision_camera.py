@@ -13,30 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tagjax.baselines.tagvision import (
-    Board,
-    CalibrateSettings,
-    CalibrationError,
-    PlaneCamera,
-    PosePicture,
-    calibrate,
-    calibrate_folder,
-    find_corners,
-    load_camera,
-    locate,
-    read_picture,
-    save_camera,
-    write_calibration,
-    write_corners,
-)
-from tagjax.evaluation.tagvision import (
-    PAPER_CAMERA,
-    CalibrationSettings,
-    board_views,
-    calibrated,
-    overhead,
-    transform_error_m,
-)
+from tagjax.baselines.tagvision import Board, CalibrateSettings, CalibrationError, PlaneCamera, PosePicture, calibrate, calibrate_folder, find_corners, load_camera, locate, read_picture, save_camera, write_calibration, write_corners
+from tagjax.evaluation.tagvision import PAPER_CAMERA, CalibrationSettings, board_views, calibrated, overhead, transform_error_m
 from tagjax.recording import Intrinsics
 
 ROOT = Path(__file__).parents[1]
@@ -244,7 +222,7 @@ def test_the_command_reports_or_says_what_is_wrong(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "new" / "camera.json").read_text())["intrinsics_reprojection_px"] < 0.15
     failed = subprocess.run([*run, given[2]], capture_output=True, text=True, cwd=ROOT)
     assert failed.returncode == 1
-    assert "give pictures=<folder" in failed.stderr
+    assert "expected pictures=<folder" in failed.stderr
 
 
 def test_folders_that_cannot_be_calibrated_are_refused(tmp_path: Path) -> None:

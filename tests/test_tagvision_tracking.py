@@ -11,17 +11,7 @@ import pytest
 import tagvision_scenes as scenes
 
 from tagjax.baselines import Claim, HostCamera, claims_to_trace, host_frames, host_trace
-from tagjax.baselines.tagvision import (
-    BlobSettings,
-    MatchSettings,
-    TagVision,
-    TagVisionSettings,
-    Tracks,
-    TrackSettings,
-    backward_flow,
-    find_blobs,
-    follow,
-)
+from tagjax.baselines.tagvision import BlobSettings, MatchSettings, TagVision, TagVisionSettings, Tracks, TrackSettings, backward_flow, find_blobs, follow
 from tagjax.evaluation.tagvision import PAPER_CAMERA, overhead
 from tagjax.metrics import recordings as evaluate
 from tagjax.recording import Recording, RecordingError, TagReads

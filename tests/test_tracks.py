@@ -14,30 +14,8 @@ import pytest
 import yaml
 
 from tagjax.core.settings import from_mapping
-from tagjax.evaluation.real_tags import (
-    SCORES,
-    align,
-    associate,
-    heard_speed,
-    places_around,
-    speed_scores,
-    speed_windows,
-)
-from tagjax.evaluation.tracks import (
-    METHODS,
-    Scene,
-    TracksConfig,
-    antenna_place,
-    association_scores,
-    load_kinect,
-    load_scenes,
-    load_xovis,
-    real_tags_markdown,
-    right,
-    run_real_tags,
-    run_tracks,
-    windows,
-)
+from tagjax.evaluation.real_tags import SCORES, align, associate, heard_speed, places_around, speed_scores, speed_windows
+from tagjax.evaluation.tracks import METHODS, Scene, TracksConfig, antenna_place, association_scores, load_kinect, load_scenes, load_xovis, real_tags_markdown, right, run_real_tags, run_tracks, windows
 from tagjax.recording import RecordingError
 from tagjax.recording.importers.tagged_walks import Speeds, Walk, load_tagged, load_uwb
 from tagjax.tagattention.attention import coherent_score
@@ -98,19 +76,19 @@ def test_tracks_are_put_side_by_side_on_one_clock(folder):
 
 
 def test_windows_are_those_in_which_the_carrier_moves(folder):
-    config = TracksConfig(str(folder), frame_rate_hz=RATE_HZ, most=1000, noise_m=0.0)
+    config = TracksConfig(str(folder), frame_rate_hz=RATE_HZ, max_windows=1000, noise_m=0.0)
     scene = load_kinect(folder / "kinect-rfid", RATE_HZ)
     found = windows(scene, 2.0, config)
     assert {window.carrier for window in found} == {0, 1}
     for window in found:
         assert window.distance_m.shape == (3, 30)
-        assert np.ptp(window.distance_m[window.carrier]) >= config.least_move_m
+        assert np.ptp(window.distance_m[window.carrier]) >= config.min_move_m
         assert np.ptp(window.distance_m[2]) < 1e-9
         stamps = window.reads.time_ns * 1e-9
         assert stamps.min() >= 0
         assert stamps.max() <= window.time_s[-1] + 1e-9
         assert 30 < window.reads.num_reads < 130
-    assert len(windows(scene, 2.0, dataclasses.replace(config, most=5))) == 5
+    assert len(windows(scene, 2.0, dataclasses.replace(config, max_windows=5))) == 5
     antenna = antenna_place(scene)
     reach = np.linalg.norm(
         np.concatenate([scene.position_m, np.zeros((*scene.position_m.shape[:2], 1))], -1) - antenna, axis=-1
@@ -130,7 +108,7 @@ def test_ties_count_for_their_share():
 
 
 def test_a_silent_tag_scores_nothing(folder):
-    config = TracksConfig(str(folder), frame_rate_hz=RATE_HZ, most=1)
+    config = TracksConfig(str(folder), frame_rate_hz=RATE_HZ, max_windows=1)
     (window,) = windows(load_kinect(folder / "kinect-rfid", RATE_HZ), 2.0, config)
     silent = dataclasses.replace(window, reads=window.reads[:2])
     assert all(not score.any() for score in association_scores(silent).values())
@@ -160,7 +138,7 @@ def test_noise_of_a_track_costs_the_doubled_angle_more_than_flips_cost_the_plain
     walks = np.stack([3.0 + 1.0 * np.sin(2 * np.pi * time_s / 6.0), np.zeros(len(time_s))], axis=-1)
     still = np.broadcast_to([4.0, 1.0], walks.shape)
     scene = Scene("walk", time_s, np.stack([walks, still]))
-    config = TracksConfig("x", noise_m=0.02, region="fixed", flip_share=0.08, most=3)
+    config = TracksConfig("x", noise_m=0.02, region="fixed", flip_share=0.08, max_windows=3)
     seen = [window for window in windows(scene, 4.0, config) if window.carrier == 0]
     scores = []
     for one in seen:
@@ -177,7 +155,7 @@ def test_noise_of_a_track_costs_the_doubled_angle_more_than_flips_cost_the_plain
 
 def test_the_configuration_names_every_setting():
     values: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "conf" / "tracks.yaml").read_text())
-    values.pop("hydra")
+    values.pop("defaults")
     assert from_mapping(TracksConfig, {**values, "folder": "x"}) == TracksConfig("x")
     assert set(values) == {field.name for field in dataclasses.fields(TracksConfig)}
 
@@ -186,7 +164,7 @@ def test_the_configuration_names_every_setting():
 def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path):
     """Without noise, flips or hops a window of 4 s suffices for all of them; a run writes what it found."""
     config = TracksConfig(
-        str(folder), windows_s=(4.0,), frame_rate_hz=RATE_HZ, most=6, noise_m=0.0, flip_share=0.0, region="fixed"
+        str(folder), windows_s=(4.0,), frame_rate_hz=RATE_HZ, max_windows=6, noise_m=0.0, flip_share=0.0, region="fixed"
     )
     rows = run_tracks(config, tmp_path, on_done=lambda name: None)["rows"]
     assert [row["scene"] for row in rows] == ["kinect-rfid", "xovis-uwb"]
@@ -202,7 +180,7 @@ def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path)
 @pytest.mark.real_data
 @pytest.mark.slow
 def test_real_tracks_tell_the_carrier_better_the_longer_one_looks(real_data, tmp_path):
-    rows = run_tracks(TracksConfig(str(real_data / "tracks"), windows_s=(1.0, 4.0), most=16), tmp_path)["rows"]
+    rows = run_tracks(TracksConfig(str(real_data / "tracks"), windows_s=(1.0, 4.0), max_windows=16), tmp_path)["rows"]
     assert {row["scene"] for row in rows} == {"kinect-rfid", "xovis-uwb"}
     for row in rows:
         assert row["accuracy"][METHODS[0]] > row["chance"]

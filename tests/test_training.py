@@ -25,23 +25,7 @@ from tagjax.recording import RecordingError
 from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
 from tagjax.training.loop import DivergedError, LoopSettings, resumed, train
-from tagjax.training.loss import (
-    TERM_NAMES,
-    TERMS,
-    ObjectiveSettings,
-    agreement,
-    area,
-    calibration,
-    clip_reads,
-    compactness,
-    contrast,
-    coverage,
-    distance_at,
-    future_agreement,
-    objective,
-    see,
-    steadiness,
-)
+from tagjax.training.loss import TERM_NAMES, TERMS, ObjectiveSettings, agreement, area, calibration, clip_reads, compactness, contrast, coverage, distance_at, future_agreement, objective, see, steadiness
 from tagjax.training.state import TrainState
 from tagjax.training.step import clip_gradient, clip_loss, make_optimizer, train_step
 
@@ -121,8 +105,8 @@ def test_likelihood_tells_tags_apart_whatever_is_flipped() -> None:
     own, own_clean = (np.einsum("iip->ip", np.asarray(one.between)) for one in (found, clean))
     # A flip costs about log(0.95 / 0.05) nats, not the read's whole weight.
     assert (own > 0.5 * own_clean).all()
-    with pytest.raises(ValueError, match="flip_share is 0"):
-        ObjectiveSettings(flip_share=0.0)
+    with pytest.raises(ValueError, match="flip_probability is 0"):
+        ObjectiveSettings(flip_probability=0.0)
 
 
 def test_reads_of_a_resting_tag_have_no_say() -> None:

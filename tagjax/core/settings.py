@@ -1,146 +1,164 @@
-"""Settings from plain nested values: unknown or mistyped keys are refused, and `_target_` names real alternatives."""
+"""Checked settings: frozen dataclasses made from the plain dictionaries of a YAML file, validated by pydantic.
+
+A schema is a frozen dataclass. `from_mapping` refuses unknown keys and values of another type at any depth, without
+conversion between types (the text "1" is no number), and reports the first fault as one line: the dotted path, what was
+found, what was expected.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
-import importlib
+import json
 import types
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
-TARGET_PREFIXES = ("tagjax.", "optax.")
-
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 T = TypeVar("T")
 
+_STRICT = ConfigDict(extra="forbid")
+_WORDS = {
+    bool: "true or false",
+    int: "int (a whole number)",
+    float: "float (a number)",
+    str: "str (a text)",
+    type(None): "null",
+}
+
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used: which key, what was found, what was expected."""
+    """Settings that cannot be used: the dotted path, what was found, what was expected."""
 
 
 def from_mapping(schema: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
-    """An instance of the dataclass `schema` from plain nested values, lists turned into tuples where a tuple is due.
+    """An instance of the dataclass `schema` from plain nested values; lists become tuples where the schema has tuples.
 
-    Raises `ConfigError` for a key that the schema does not know, one that is missing, a value of another type, or one
-    that the schema itself refuses.
+    `where` is the dotted path of `values` in the configuration, for error messages. Raises `ConfigError` for an unknown
+    or missing key, a value of another type, or a value that the schema's own `__post_init__` refuses.
     """
-    fields = {field.name: field for field in dataclasses.fields(schema)}  # type: ignore[arg-type]
-    unknown = sorted(set(map(str, values)) - set(fields))
-    if unknown:
-        raise ConfigError(
-            f"{where or schema.__name__}: unknown key {', '.join(map(repr, unknown))}; known are {', '.join(fields)}."
-        )
-    hints = typing.get_type_hints(schema)
-    given = {name: _convert(hints[name], value, f"{where}.{name}".lstrip(".")) for name, value in values.items()}
+    # JSON in strict mode: a list is a tuple and a whole number is a float, and nothing else is converted.
+    text = json.dumps(dict(values), default=_plain)
     try:
-        return schema(**given)
-    except TypeError as error:
-        raise ConfigError(f"{where or schema.__name__}: {error}.") from error
-    except ValueError as error:
-        raise ConfigError(f"{where or schema.__name__}: {error}") from error
+        return _adapter(schema).validate_json(text, strict=True)
+    except ValidationError as error:
+        raise ConfigError(_message(error, schema, json.loads(text), where)) from error
 
 
 def changed(settings: T, values: Mapping[str, Any], *, where: str) -> T:
-    """The settings with those values that are not None in their places. Errors as of `from_mapping`."""
+    """A copy of `settings` in which those of `values` that are not None replace the old ones. Errors as `from_mapping`."""
     given = {name: value for name, value in values.items() if value is not None}
     return from_mapping(type(settings), {**vars(settings), **given}, where=where)
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    wrong = ConfigError(f"{where}: found {value!r}; expected {getattr(hint, '__name__', str(hint))}.")
-    if hint is Any:
-        return value
-    if origin in (types.UnionType, typing.Union):
-        if value is None:
-            if type(None) in arguments:
-                return None
-            raise wrong
-        return _convert_to_any([a for a in arguments if a is not type(None)], value, where)
-    if origin is Literal:
-        if value not in arguments:
-            raise ConfigError(f"{where}: found {value!r}; expected one of {', '.join(map(repr, arguments))}.")
-        return value
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if not isinstance(value, Mapping | hint):
-            raise ConfigError(f"{where}: found {value!r}; expected keys and values.")
-        return from_mapping(hint, value, where=where) if isinstance(value, Mapping) else value
-    if origin is tuple:
-        if isinstance(value, str) or not isinstance(value, Sequence):
-            raise ConfigError(f"{where}: found {value!r}; expected a list.")
-        each = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
-        if len(each) != len(value):
-            raise ConfigError(f"{where}: found {len(value)} elements; expected {len(each)}.")
-        return tuple(
-            _convert(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(zip(each, value, strict=True))
-        )
-    if origin is not None and issubclass(origin, Mapping):
-        if not isinstance(value, Mapping):
-            raise wrong
-        return {str(key): _convert(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):  # pyright: ignore[reportArgumentType]
-        raise wrong
-    return value
+@functools.cache
+def _adapter(schema: type) -> Any:  # a TypeAdapter, which the runtime type checker does not know
+    _forbid_unknown_keys(schema)
+    return TypeAdapter(schema)
 
 
-def _convert_to_any(hints: Sequence[Any], value: Any, where: str) -> Any:
-    """The first of the alternatives that takes the value."""
-    wrongs = []
-    for hint in hints:
-        try:
-            return _convert(hint, value, where)
-        except ConfigError as wrong:
-            wrongs.append(wrong)
-    if len(wrongs) == 1:
-        raise wrongs[0]
-    raise ConfigError(f"{where}: found {value!r}; none of these: " + "; ".join(str(wrong) for wrong in wrongs))
+def _forbid_unknown_keys(hint: Any) -> None:
+    """Set pydantic's option on every dataclass that a value of this type may hold: by itself it ignores unknown keys."""
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type) and "__pydantic_config__" not in vars(hint):
+        hint.__pydantic_config__ = _STRICT  # type: ignore[attr-defined]
+        for each in typing.get_type_hints(hint).values():
+            _forbid_unknown_keys(each)
+    for each in typing.get_args(hint):
+        _forbid_unknown_keys(each)
 
 
-def build(settings: Mapping[str, Any], *, where: str = "_target_") -> Any:
-    """Call what `_target_` names with the other keys; nested mappings with a `_target_` are built first.
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise ConfigError(f"found {value!r} of type {type(value).__name__}; expected plain values, lists and mappings.")
 
-    Raises `ConfigError` for a target outside this package and Optax, one that does not exist, or arguments that it does
-    not take.
+
+def _message(error: ValidationError, schema: type, values: Any, where: str) -> str:
+    """The first fault as one line."""
+    faults = error.errors(include_url=False)
+    fault = faults[0]
+    path, hint, found = _follow(fault["loc"], schema, values)
+    place = _dotted(where, path)
+    if fault["type"] == "unexpected_keyword_argument":
+        parent = path[:-1]
+        unknown = [str(one["loc"][-1]) for one in faults if one["type"] == fault["type"] and one["loc"][:-1] == parent]
+        return _unknown_keys(unknown, _follow(parent, schema, values)[1], _dotted(where, parent) or schema.__name__)
+    if fault["type"] in ("value_error", "assertion_error"):
+        return f"{place or schema.__name__}: {fault.get('ctx', {}).get('error', fault['msg'])}"
+    if fault["type"] in ("missing", "missing_argument") and not isinstance(path[-1], int):
+        return f"{_dotted(where, path[:-1]) or schema.__name__}: no key {path[-1]!r}; expected one: {_expected(hint)}."
+    if fault["type"] in ("missing", "too_long"):  # a tuple of fixed length
+        whole = path[:-1] if fault["type"] == "missing" else path
+        _, hint, found = _follow(whole, schema, values)
+        return f"{_dotted(where, whole)}: found {len(found)} elements; expected {len(_tuple_hints(hint))}."
+    return f"{place or schema.__name__}: found {found!r}; expected {_expected(hint)}."
+
+
+def _unknown_keys(unknown: Sequence[str], schema: Any, place: str) -> str:
+    known = [field.name for field in dataclasses.fields(_without_none(schema))]
+    close = difflib.get_close_matches(unknown[0], known, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else "."
+    return f"{place}: unknown key {', '.join(map(repr, unknown))}; known keys are {', '.join(known)}{hint}"
+
+
+def _follow(location: Sequence[int | str], hint: Any, values: Any) -> tuple[tuple[int | str, ...], Any, Any]:
+    """The path of a fault, the type at its end, and the value found there.
+
+    The path ends at a union of several types: what pydantic adds below names the alternative that it tried.
     """
-    target = settings.get("_target_")
-    if not isinstance(target, str) or not target.startswith(TARGET_PREFIXES):
-        raise ConfigError(
-            f"{where}: found {target!r}; expected a name that starts with {' or '.join(TARGET_PREFIXES)}."
-        )
-    arguments = {
-        str(key): build(value, where=f"{where}.{key}") if isinstance(value, Mapping) and "_target_" in value else value
-        for key, value in settings.items()
-        if key != "_target_"
-    }
-    called = _resolve(target, where)
-    try:
-        return called(**arguments)
-    except TypeError as error:
-        raise ConfigError(f"{where}: {target} does not take these settings: {error}.") from error
-    except ValueError as error:
-        raise ConfigError(f"{where}: {error}") from error
+    path: list[int | str] = []
+    for step in location:
+        inner = _without_none(hint)
+        if _is_union(inner):
+            break
+        path.append(step)
+        if dataclasses.is_dataclass(inner):
+            hint = typing.get_type_hints(inner).get(str(step), Any)
+        elif typing.get_origin(inner) is tuple:
+            arguments = _tuple_hints(inner)
+            hint = arguments[0] if arguments[-1] is Ellipsis else arguments[min(int(step), len(arguments) - 1)]
+        elif typing.get_args(inner):
+            hint = typing.get_args(inner)[-1]
+        inside = isinstance(values, Mapping) and step in values
+        inside |= isinstance(values, list) and isinstance(step, int) and step < len(values)
+        values = values[step] if inside else None
+    return tuple(path), hint, values
 
 
-def _resolve(target: str, where: str) -> Any:
-    parts = target.split(".")
-    for cut in range(len(parts) - 1, 0, -1):
-        try:
-            module = importlib.import_module(".".join(parts[:cut]))
-        except ModuleNotFoundError:
-            continue
-        if any(part.startswith("_") for part in parts[cut:]):
-            break
-        try:
-            found = functools.reduce(getattr, parts[cut:], module)
-        except AttributeError:
-            break
-        # What a module has merely imported is not its own: no way round the prefixes.
-        owner = getattr(found, "__module__", None) or ""
-        if callable(found) and (owner + ".").startswith(TARGET_PREFIXES):
-            return found
-        break
-    raise ConfigError(f"{where}: there is no {target!r} that can be called; check the spelling.")
+def _dotted(where: str, path: Sequence[int | str]) -> str:
+    return "".join([where, *(f"[{one}]" if isinstance(one, int) else f".{one}" for one in path)]).lstrip(".")
+
+
+def _is_union(hint: Any) -> bool:
+    return typing.get_origin(hint) in (types.UnionType, typing.Union)
+
+
+def _without_none(hint: Any) -> Any:
+    """The type without None, if only one alternative then remains."""
+    if _is_union(hint):
+        others = [one for one in typing.get_args(hint) if one is not type(None)]
+        return others[0] if len(others) == 1 else hint
+    return hint
+
+
+def _tuple_hints(hint: Any) -> tuple[Any, ...]:
+    return typing.get_args(_without_none(hint))
+
+
+def _expected(hint: Any) -> str:
+    """A type in words."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if _is_union(hint):
+        return " or ".join(_expected(one) for one in arguments)
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, arguments))}" if len(arguments) > 1 else repr(arguments[0])
+    if origin is tuple:
+        return f"a list of {_expected(arguments[0])}"
+    if dataclasses.is_dataclass(hint) or (isinstance(origin, type) and issubclass(origin, Mapping)):
+        return "keys and values"
+    return _WORDS.get(hint, str(getattr(hint, "__name__", hint)))

@@ -56,7 +56,7 @@ class FlowEvaluationSettings:
     folders: tuple[str, ...] = ()  # of Middlebury's kind
     sequences: tuple[str, ...] = ()  # videos and folders of pictures, without truth
     every: int = 5  # of recordings and sequences, every n-th picture and the next
-    most: int = 40  # pairs of one recording or sequence
+    max_pairs: int = 40  # of one recording or sequence
     moving_px: float = 0.5
     num_panels: int = 4  # of each material
     cache: str = "recordings"  # for decoded videos
@@ -69,7 +69,7 @@ class FlowEvaluationSettings:
             raise ValueError(
                 "Nothing to evaluate on: num_pairs is 0, and no recordings, folders or sequences are named."
             )
-        for name, least in (("num_pairs", 0), ("every", 1), ("most", 1), ("num_panels", 0)):
+        for name, least in (("num_pairs", 0), ("every", 1), ("max_pairs", 1), ("num_panels", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected at least {least}.")
 
@@ -84,10 +84,10 @@ class FlowEvaluationSettings:
                 photographs = photograph_stack(installed_photographs(), self.pair_seed)
             found.append(drawn_material(self.pairs, self.num_pairs, seed=self.pair_seed, photographs=photographs))
         if self.recordings:
-            found.append(recording_material(self.recordings, every=self.every, most=self.most))
+            found.append(recording_material(self.recordings, every=self.every, most=self.max_pairs))
         found += [folder_material(path) for path in self.folders]
         if self.sequences:
-            found.append(sequence_material(self.sequences, Path(self.cache), every=self.every, most=self.most))
+            found.append(sequence_material(self.sequences, Path(self.cache), every=self.every, most=self.max_pairs))
         return found
 
 

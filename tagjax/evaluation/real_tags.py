@@ -170,7 +170,7 @@ class SpeedWindow:
     carrier: int
 
 
-def speed_windows(one: Association, length_s: float, least_move_m: float) -> list[SpeedWindow]:
+def speed_windows(one: Association, length_s: float, min_move_m: float) -> list[SpeedWindow]:
     """Windows in which the tag is heard throughout and its carrier's distance changes, half overlapping.
 
     The clocks are apart as the carrier's whole track says.
@@ -189,7 +189,7 @@ def speed_windows(one: Association, length_s: float, least_move_m: float) -> lis
     for start in range(0, len(clock) - num + 1, max(num // 2, 1)):
         span = slice(start, start + num)
         here = np.all(np.isfinite(distance[:, span]), axis=1)
-        if not np.isfinite(heard[span]).all() or here.sum() < 2 or np.ptp(distance[carrier, span]) < least_move_m:
+        if not np.isfinite(heard[span]).all() or here.sum() < 2 or np.ptp(distance[carrier, span]) < min_move_m:
             continue
         found.append(
             SpeedWindow(clock[span] - clock[start], distance[here][:, span], heard[span], int(here[:carrier].sum()))

@@ -11,10 +11,11 @@ from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
 from ..recording.opening import VirtualTagSettings, opened
-from ..tracing.clips import ClipSettings, check_clip
+from ..tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from ..tracing.clips import ClipSettings
 from ..training.checkpoint import Checkpoints
 from ..training.config import TrainConfig
-from ..training.run import evaluate_tracers, initial_state, make_tracer, own_flow
+from ..training.run import evaluate_tracers, initial_state, own_flow
 from ..training.sources import DataSettings, training_recordings
 from ..training.state import TrainState
 
@@ -41,8 +42,9 @@ def run_evaluation(
 ) -> dict[str, Any]:
     """Evaluate and return the report's summary, which is also written to `folder`.
 
-    `run_values` is the configuration found in the run folder; what `config` leaves open is taken from it. Without
-    recordings the run's own held-out ones are used. Raises `ConfigError` where neither names a tracer or a recording.
+    `run_values` is the configuration found in the run folder. What `config` leaves open is taken from it, or else from the
+    file of learned parameters or the tracer's configuration. Without recordings the run's own held-out ones are used. Raises
+    `ConfigError` where nothing names a tracer or a recording.
     """
     clips, scores, baselines, recordings = ClipSettings(), ScoreSettings(), dict(config.baselines or {}), []
     estimators = dict(config.baseline_estimators or {})
@@ -59,18 +61,23 @@ def run_evaluation(
         estimators = dict(trained.baseline_estimators) | estimators
         if not config.recordings:
             recordings = held_out(trained.data)
+    elif config.weights is not None:
+        tracer, clips = learned_tracer(config.weights, config.tracer)
+        tracers = {"learned": tracer}
     elif config.tracer is not None:
-        name = "untrained" if config.weights is None else "learned"
-        tracers = {name: make_tracer(config.tracer, config.weights)}
+        tracers, clips = {"untrained": make_tracer(config.tracer)}, tracer_clips(config.tracer)
     else:
-        raise ConfigError("Nothing to evaluate: give run=<folder of experiments.train>, or tracer=<name> untrained.")
-    clips = changed(
-        clips, {**config.clips, **({} if config.stride is None else {"stride": config.stride})}, where="clips"
-    )
+        raise ConfigError(
+            "Nothing to evaluate: expected run=<folder of experiments.train>, weights=<default, a name or a file>, or "
+            "tracer=<name> for an untrained tracer."
+        )
+    clips = changed(clips, config.clips, where="clips")
     epcs = clips.epcs if config.epcs is None else config.epcs
     recordings += opened(config.recordings, config.virtual_tag)
     if not recordings:
-        raise ConfigError("No recording to evaluate on: give recordings=[a.zarr,...]; the run held none out.")
+        raise ConfigError(
+            "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with held-out recordings."
+        )
     tracers |= {name: make_tracer(settings) for name, settings in baselines.items()}
     return evaluate_tracers(
         tracers,
@@ -88,34 +95,35 @@ def run_evaluation(
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateConfig:
-    """Everything of an evaluation. What is None is taken from the run."""
+    """All settings of an evaluation. What is None is taken from the run, the weights, or the tracer's configuration."""
 
-    run: str | None = None  # a run folder of experiments.train; without it `tracer` is evaluated untrained
+    run: str | None = None  # a run folder of experiments.train
     checkpoint: int | None = None  # step; the newest if None
     tracer: Mapping[str, Any] | None = None
     weights: str | None = (
-        None  # learned parameters of `tracer`: `default`, a name, or a file (tagjax.tagattention.learned)
+        None  # learned parameters: `default`, a name, or a file; they name their tracer if `tracer` is None
     )
     recordings: tuple[str, ...] = ()
     epcs: tuple[str, ...] | None = None
-    stride: int | None = None
     frames: tuple[int, int] | None = None
-    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ClipSettings`
+    clips: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # in place of the run's, the weights' or the tracer's
     baselines: Mapping[str, Mapping[str, Any]] | None = None
     baseline_estimators: Mapping[str, str] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
-    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's, or of `ScoreSettings`
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's
     progress: bool = True
 
     def __post_init__(self) -> None:
-        if self.stride is not None:
-            check_clip(stride=self.stride)
         changed(ClipSettings(), self.clips, where="clips")
         changed(ScoreSettings(), self.scores, where="scores")
         for name, other in (("tracer", self.tracer), ("weights", self.weights)):
             if self.run is not None and other is not None:
-                raise ConfigError(f"run={self.run} has a tracer and parameters of its own: leave out {name}=, or run=.")
+                raise ConfigError(
+                    f"found both run={self.run} and {name}=; expected one of them, because a run has its own tracer and parameters."
+                )
         if self.run is None and self.checkpoint is not None:
             raise ConfigError(
-                f"checkpoint={self.checkpoint} is one of a run's: give run=<folder of experiments.train>."
+                f"found checkpoint={self.checkpoint} without run; expected run=<folder of experiments.train> with it."
             )

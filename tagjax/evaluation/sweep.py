@@ -1,7 +1,7 @@
-"""A grid of a tracer's parameters over benchmark suites: IoU against frame number, a table, and the best point.
+"""A grid of a tracer's parameters over suites: IoU against frame number, a table, and the best point.
 
 TagAttention (ToN 2021), Fig. 17 is such a sweep: v0 at 0.01, 0.1 and 0.5 m/s, for a slow and for a fast object. Every
-recording at every point is a line of a file, so that a sweep that was killed goes on where it was.
+recording at every point is a line of a file, so that a killed sweep resumes.
 """
 
 from __future__ import annotations
@@ -18,50 +18,56 @@ from typing import Any
 
 import numpy as np
 
-from ..core.settings import ConfigError, from_mapping
+from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording.store import open_recording
 from ..report.report import plain
 from ..report.sweep import curve_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
+from ..tagattention.tracer_settings import make_tracer, tracer_clips
 from ..tracing.clips import ClipSettings, clip_loader
-from ..training.run import make_tracer
 
 _FEW = 6
-"""Up to so many points have a line each; more are shown by parameter."""
+"""Up to this many points have a curve each; more are shown by parameter."""
 
 _LINES = "lines.jsonl"
 
 Value = int | float | str | bool
-"""Of a parameter: whole numbers and words stay what they are."""
+"""A parameter's value; whole numbers and texts keep their type."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepConfig:
-    """What is swept over what. `suites` are those of `conf/benchmark`, as their files say."""
+    """The grid and the suites; `suites` has the settings of each by name, as in the files of conf/suite."""
 
     suites: Mapping[str, Mapping[str, Any]]
     tracer: Mapping[str, Any]
     grid: Mapping[str, tuple[Value, ...]]  # values of the tracer's parameters; all combinations are tried
-    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
+    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the tracer's
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
-    out: str = "recordings/benchmark"
+    recordings_dir: str = "recordings"
     splits: tuple[str, ...] = ("test",)
     width: int | None = None  # of the simulated pictures; the suite's own if None
-    most: int | None = None  # recordings of each variant and split; all if None
+    max_recordings: int | None = None  # of each variant and split; all if None
     smoke: bool = False
     workers: int = 1  # processes that simulate what is missing
 
     def __post_init__(self) -> None:
         if not self.suites:
-            raise ConfigError("No suite to sweep over: suites=[velocity_threshold], for example.")
+            raise ConfigError("suites is empty; expected names of suites, for example suites=[velocity_threshold].")
         if unknown := sorted(set(self.splits) - set(SPLITS)):
-            raise ConfigError(f"Unknown splits {', '.join(unknown)}; expected some of {', '.join(SPLITS)}.")
+            raise ConfigError(f"splits: found {', '.join(unknown)}; expected some of {', '.join(SPLITS)}.")
         if not self.grid or not all(self.grid.values()):
-            raise ConfigError("The grid is empty: 'grid={v0_m_s:[0.01,0.1,0.5]}', for example.")
+            raise ConfigError(
+                "grid is empty; expected values of the tracer's parameters, for example 'grid={v0_m_s:[0.01,0.1,0.5]}'."
+            )
         if unknown := sorted(set(self.grid) - set(self.tracer)):
-            known = ", ".join(sorted(set(self.tracer) - {"_target_"}))
-            raise ConfigError(f"grid: the tracer has no {', '.join(unknown)}; it has {known}.")
+            known = ", ".join(sorted(set(self.tracer) - {"_target_", "clips"}))
+            raise ConfigError(f"grid: found {', '.join(unknown)}; expected parameters of the tracer, some of {known}.")
+
+    def clip_settings(self) -> ClipSettings:
+        """Those of the tracer's configuration, with the values of `clips` in their places."""
+        return changed(tracer_clips(self.tracer), self.clips, where="clips")
 
     def points(self) -> list[dict[str, Value]]:
         """Every combination of the grid's values."""
@@ -72,12 +78,12 @@ class SweepConfig:
 class Line:
     """One recording at one point of the grid."""
 
-    key: str  # of everything that the numbers follow from
+    key: str  # hash of everything that determines the numbers
     condition: str  # suite and variant
     recording: str
     point: Mapping[str, Value]
     numbers: Mapping[str, float | int | None]
-    iou: tuple[float | None, ...]  # by frame, mean over tags that show; no claim counts as 0
+    iou: tuple[float | None, ...]  # by frame, mean over visible tags; no detection counts as 0
 
 
 def run_sweep(
@@ -85,18 +91,18 @@ def run_sweep(
 ) -> list[Line]:
     """The lines of all recordings at all points; `folder` then holds them, table.md, table.csv and sweep.png.
 
-    Lines that the folder holds already are not computed again. `on_progress` is told how many of how many are done,
-    and which is next.
+    Lines that the folder holds already are not computed again. `on_progress` gets the number of finished lines, the number of all, and the
+    name of the next one.
     """
-    tell = on_progress or (lambda done, total, name: None)
+    report = on_progress or (lambda done, total, name: None)
     folder.mkdir(parents=True, exist_ok=True)
-    points = config.points()
-    tracers = [make_tracer({**config.tracer, **point}) for point in points]  # a wrong value is told before the work
+    points, clips = config.points(), config.clip_settings()
+    tracers = [make_tracer({**config.tracer, **point}) for point in points]  # a wrong value raises before the work
     work = [
         (suite, item)
         for name, values in config.suites.items()
-        for suite in [_suite(config, from_mapping(Suite, values, where=f"benchmark {name}"))]
-        for item in _items(config, suite, lambda made: tell(0, 0, f"simulated {made}"))
+        for suite in [_suite(config, from_mapping(Suite, values, where=f"suite {name}"))]
+        for item in _items(config, suite, lambda made: report(0, 0, f"simulated {made}"))
     ]
     known = {line.key: line for line in read_lines(folder / _LINES)}
     lines: list[Line] = []
@@ -105,14 +111,14 @@ def run_sweep(
         if all(key in known for key in keys):
             lines += [known[key] for key in keys]
             continue
-        recording = open_recording(item.path(Path(config.out)))
-        load = _remembered(config.clips)
+        recording = open_recording(item.path(Path(config.recordings_dir)))
+        load = _caching_loader(clips)
         for key, point, tracer in zip(keys, points, tracers, strict=True):
-            tell(len(lines), len(work) * len(points), f"{item.name} {said(point)}")
+            report(len(lines), len(work) * len(points), f"{item.name} {point_name(point)}")
             if key not in known:
                 settings = dataclasses.replace(config.scores, num_pictures=1)
                 result = evaluate_recording(
-                    tracer, recording, load, stride=config.clips.stride, epcs=config.clips.epcs, settings=settings
+                    tracer, recording, load, stride=clips.stride, epcs=clips.epcs, settings=settings
                 )
                 known[key] = Line(key, _condition(item), item.name, point, result.scores().result(), frame_iou(result))
                 _append(folder / _LINES, known[key])
@@ -128,22 +134,22 @@ def _suite(config: SweepConfig, suite: Suite) -> Suite:
     return dataclasses.replace(suite, capture=dataclasses.replace(suite.capture, width=config.width))
 
 
-def _items(config: SweepConfig, suite: Suite, tell: Callable[[str], None]) -> list[Item]:
+def _items(config: SweepConfig, suite: Suite, report: Callable[[str], None]) -> list[Item]:
     items = make_items(
         suite,
-        Path(config.out),
+        Path(config.recordings_dir),
         splits=config.splits,
-        max_per_variant=config.most,
+        max_per_variant=config.max_recordings,
         workers=config.workers,
-        on_done=lambda made: tell(made.name),
+        on_done=lambda made: report(made.name),
     )
     if not items:
         raise ConfigError(f"{suite.name} has no recording of {', '.join(config.splits)}; choose other splits.")
     return items
 
 
-def _remembered(clips: ClipSettings) -> Callable[..., Any]:
-    """A loader that keeps what it loaded: every point of the grid sees the same pieces."""
+def _caching_loader(clips: ClipSettings) -> Callable[..., Any]:
+    """A loader that keeps the loaded clips: every point of the grid sees the same."""
     load_piece, held = clip_loader(clips), {}
 
     def load(recording: Any, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Any:
@@ -156,12 +162,12 @@ def _remembered(clips: ClipSettings) -> Callable[..., Any]:
 
 
 def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, Value]) -> str:
-    scene = {**dataclasses.asdict(suite), "counts": None}  # how many others there are changes nothing
+    scene = {**dataclasses.asdict(suite), "counts": None}  # the number of other recordings changes nothing
     parts = [
         scene,
         item.name,
         {**config.tracer, **point},
-        dataclasses.asdict(config.clips),
+        dataclasses.asdict(config.clip_settings()),
         dataclasses.asdict(config.scores),
     ]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:20]
@@ -172,7 +178,7 @@ def _condition(item: Item) -> str:
 
 
 def frame_iou(result: RecordingResult) -> tuple[float | None, ...]:
-    """Box IoU of every frame, mean over the tags that show; None where none does."""
+    """Box IoU of every frame, mean over the visible tags; None where none is."""
     frames = list(result.frames.values())
     if not frames:
         return ()
@@ -189,7 +195,7 @@ def _append(path: Path, line: Line) -> None:
 
 
 def read_lines(path: Path) -> list[Line]:
-    """The finished lines of a sweep's file; one that a kill cut short is taken away."""
+    """The finished lines of a sweep's file; an incomplete last line is removed."""
     if not path.exists():
         return []
     text = path.read_text(encoding="utf-8")
@@ -200,8 +206,8 @@ def read_lines(path: Path) -> list[Line]:
     return [Line(**{**row, "iou": tuple(row["iou"])}) for row in rows]
 
 
-def said(point: Mapping[str, Value]) -> str:
-    """A point of the grid in words."""
+def point_name(point: Mapping[str, Value]) -> str:
+    """A point of the grid as `name=value` pairs."""
     return ", ".join(f"{name}={value_text(value)}" for name, value in point.items())
 
 
@@ -213,8 +219,8 @@ def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
     rows: dict[str, dict[str, Any]] = {}
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
-        rows.setdefault(said(line.point), {**line.point})
-        groups.setdefault((said(line.point), line.condition), []).append(line)
+        rows.setdefault(point_name(line.point), {**line.point})
+        groups.setdefault((point_name(line.point), line.condition), []).append(line)
     for (point, condition), ones in groups.items():
         count = sum(int(one.numbers["num_frames"] or 0) for one in ones)
         total = sum(float(one.numbers["iou"] or 0.0) * int(one.numbers["num_frames"] or 0) for one in ones)
@@ -242,7 +248,7 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
     if len(points) <= _FEW:
         curves = {
             condition: {
-                said(point): _mean_curve(
+                point_name(point): _mean_curve(
                     [one.iou for one in lines if one.condition == condition and one.point == point]
                 )
                 for point in points

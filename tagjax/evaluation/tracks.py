@@ -56,8 +56,8 @@ class TracksConfig:
     windows_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     frame_rate_hz: float = 15.0  # tracks are brought to it
     noise_m: float = 0.02  # standard deviation of a track's noise, by frame and axis
-    least_move_m: float = 0.16  # half a wavelength: windows in which the tag's distance changes by less are left out
-    most: int = 40  # windows of each length and scene
+    min_move_m: float = 0.16  # half a wavelength: windows in which the tag's distance changes by less are left out
+    max_windows: int = 40  # of each length and scene
     xovis_unit_m: float = 0.02
     region: str = "fcc"
     flip_share: float = 0.08
@@ -68,9 +68,9 @@ class TracksConfig:
             raise ValueError(
                 f"windows_s is {self.windows_s} at {self.frame_rate_hz} frames/s; at least {_NUM_WINDOW} frames are needed."
             )
-        if self.noise_m < 0 or self.most < 1 or not self.xovis_unit_m > 0:
+        if self.noise_m < 0 or self.max_windows < 1 or not self.xovis_unit_m > 0:
             raise ValueError(
-                f"noise_m {self.noise_m}, most {self.most}, xovis_unit_m {self.xovis_unit_m}; expected not negative, at least "
+                f"noise_m {self.noise_m}, max_windows {self.max_windows}, xovis_unit_m {self.xovis_unit_m}; expected not negative, at least "
                 "1, and positive."
             )
 
@@ -153,7 +153,7 @@ class Window:
 
 
 def windows(scene: Scene, length_s: float, config: TracksConfig) -> list[Window]:
-    """Windows of a length, at most `config.most` spread over tags and times, each with two people or more."""
+    """Windows of a length, at most `config.max_windows` spread over tags and times, each with two people or more."""
     rng = np.random.default_rng([config.seed, len(scene.name)])
     antenna, found = antenna_place(scene), []
     three = lambda place: np.concatenate([place, np.zeros((*place.shape[:-1], 1))], axis=-1)  # noqa: E731
@@ -169,14 +169,14 @@ def windows(scene: Scene, length_s: float, config: TracksConfig) -> list[Window]
         for start in range(0, len(scene.time_s) - num, max(num // 2, 1)):
             span = slice(start, start + num)
             here = np.all(np.isfinite(true_m[:, span]), axis=1)
-            if not here[person] or here.sum() < 2 or np.ptp(true_m[person, span]) < config.least_move_m:
+            if not here[person] or here.sum() < 2 or np.ptp(true_m[person, span]) < config.min_move_m:
                 continue
             first, last = scene.time_s[start], scene.time_s[start + num - 1]
             inside = (reads.time_ns >= first * 1e9) & (reads.time_ns <= last * 1e9)
             own = dataclasses.replace(reads[inside], time_ns=reads.time_ns[inside] - round(first * 1e9))
             carrier = int(np.sum(here[:person]))
             found.append(Window(scene.time_s[span] - first, seen_m[here][:, span], own, carrier))
-    chosen = np.linspace(0, len(found) - 1, min(len(found), config.most)).round().astype(int) if found else []
+    chosen = np.linspace(0, len(found) - 1, min(len(found), config.max_windows)).round().astype(int) if found else []
     return [found[i] for i in chosen]
 
 
@@ -280,7 +280,7 @@ def run_real_tags(config: TracksConfig, folder: Path, on_done: Callable[[str], N
         found = associate(tagged)
         whole += found
         for length_s in config.windows_s:
-            seen = [window for one in found for window in speed_windows(one, length_s, config.least_move_m)]
+            seen = [window for one in found for window in speed_windows(one, length_s, config.min_move_m)]
             scored = ((len(one.distance_m), one.carrier, speed_scores(one)) for one in seen)
             rows += _accuracy(name, length_s, SCORES, scored)
     if not whole:

@@ -81,7 +81,7 @@ def _exact(recording: Recording, first: int, last: int) -> tuple[np.ndarray, np.
     if ahead is None or back is None:
         raise RecordingError(
             f"{recording.name}: flow=truth, but the recording does not hold its true flow both ways. Simulate it with "
-            "`capture: {flow: true}`, as conf/benchmark/corpus.yaml does, or name a flow that is computed (dis)."
+            "`capture: {flow: true}`, as conf/suite/corpus.yaml does, or name a flow that is computed (dis)."
         )
     return _after_none(
         recording,

@@ -39,7 +39,7 @@ class FlowLossSettings:
     edge_weight: float = 50.0  # of the mean absolute colour difference (0 to 1) between neighbours
     occlusion: bool = True
     occlusion_after: int = 500  # steps before which nothing counts as hidden: from scratch, everything would be
-    occlusion_share: float = 0.01  # of the squared lengths
+    occlusion_fraction: float = 0.01  # of the squared lengths
     occlusion_px2: float = 0.5
     self_supervision: float = 0.0
     self_supervision_after: int = 3000
@@ -207,7 +207,7 @@ def shown(
     """
     visible = inside(flow_px, margin_px).astype(flow_px.dtype)
     if settings.occlusion:
-        hidden = occluded(flow_px, back_px, settings.occlusion_share, settings.occlusion_px2)
+        hidden = occluded(flow_px, back_px, settings.occlusion_fraction, settings.occlusion_px2)
         if margin_px:
             hidden = hidden & inside(flow_px)
         visible = visible * (1 - hide * hidden.astype(flow_px.dtype))

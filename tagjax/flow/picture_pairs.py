@@ -54,16 +54,16 @@ class VariationSettings:
     margin_px: int = 0  # at each side of the cut, seen by the loss alone (SMURF's full-image warping)
     scale: tuple[float, float] = (0.7, 1.4)  # log-uniform; a picture too small is enlarged to fit
     turn_deg: float = 10.0
-    gaps: tuple[int, ...] = (1, 2)  # frames between the pictures of a pair
+    gaps: tuple[int, ...] = (1, 2, 4)  # frames between the pictures of a pair
     gain: float = 0.25  # of both pictures
     gamma: float = 0.25
     tint: float = 0.1  # of each colour
     unlike: float = 0.05  # gain between the two pictures
     noise: float = 0.02
-    grey_share: float = 0.1  # pairs without colour
-    transpose_share: float = 0.0  # pairs whose rows become columns
-    negative_share: float = 0.0  # pairs with dark and bright exchanged
-    recolour_share: float = 0.0  # pairs whose colours change places
+    grey_probability: float = 0.1  # pairs without colour
+    transpose_probability: float = 0.0  # pairs whose rows become columns
+    negative_probability: float = 0.0  # pairs with dark and bright exchanged
+    recolour_probability: float = 0.0  # pairs whose colours change places
 
     def __post_init__(self) -> None:
         low, high = self.scale
@@ -75,7 +75,7 @@ class VariationSettings:
             raise ValueError(f"gaps are {self.gaps}; expected frame distances of at least 1.")
         if min(self.height, self.width) < 32:
             raise ValueError(f"Crops of {self.height} x {self.width} are too small; use at least 32 x 32.")
-        for name in ("grey_share", "transpose_share", "negative_share", "recolour_share"):
+        for name in ("grey_probability", "transpose_probability", "negative_probability", "recolour_probability"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected a share, 0 to 1.")
 
@@ -280,11 +280,11 @@ def _relit(
     unlike = rng.uniform(-settings.unlike, settings.unlike, (2, 1, 1, 1))
     tint = rng.uniform(-settings.tint, settings.tint, (1, 1, 1, 3))
     seen = seen * (1 + rng.uniform(-settings.gain, settings.gain) + unlike + tint).astype(np.float32)
-    if rng.uniform() < settings.grey_share:
+    if rng.uniform() < settings.grey_probability:
         seen = np.repeat(np.mean(seen, axis=-1, keepdims=True), 3, axis=-1)
-    if _chance(rng, settings.negative_share):
+    if _chance(rng, settings.negative_probability):
         seen = 1 - seen
-    if _chance(rng, settings.recolour_share):
+    if _chance(rng, settings.recolour_probability):
         seen = seen[..., rng.permutation(3)]
     noise = rng.standard_normal(seen.shape, np.float32) * np.float32(settings.noise * rng.uniform() ** 2)
     return np.clip(np.rint(255 * (seen + noise)), 0, 255).astype(np.uint8)
@@ -305,7 +305,7 @@ def _placed(
     mirror = rng.choice([-1.0, 1.0], 2)
     cosine, sine = np.cos(turn) / scale, np.sin(turn) / scale
     linear = np.array([[cosine, -sine], [sine, cosine]]) * mirror
-    if _chance(rng, settings.transpose_share):
+    if _chance(rng, settings.transpose_probability):
         linear = linear[:, ::-1]
     corner = centre - linear @ np.array([(columns - 1) / 2, (rows - 1) / 2])
     return np.concatenate([linear, corner[:, None]], axis=1), float(scale)

@@ -21,7 +21,7 @@ from .virtual_tags import attach_virtual_tags, load_tracks_csv
 
 @dataclasses.dataclass(frozen=True)
 class VirtualTagSettings:
-    """Virtual tags for recordings whose tracks are known: each label in turn, by itself, at the full read rate."""
+    """Virtual tags for recordings with known tracks: one tag on each label, each simulated alone at the full read rate."""
 
     tracks: str | None = None  # CSV: frame,person,x_m,y_m,z_m,range_m,visible
     labels: str | None = None  # folder of label masks NNNNNNNN.png
@@ -33,7 +33,7 @@ class VirtualTagSettings:
             raise ConfigError("seeds is empty; expected at least one: a reader and its noise are drawn for each.")
         if self.tracks is None and (self.labels, self.seeds, dict(self.reader)) != (None, (0,), {}):
             raise ConfigError(
-                "tracks is null, so there is no virtual tag; give tracks (a CSV file), or nothing of the rest."
+                "tracks is null, so there is no virtual tag; give tracks (a CSV file), or leave out labels, seeds and reader."
             )
 
 

@@ -308,14 +308,15 @@ def make_items(
 
 @dataclasses.dataclass(frozen=True)
 class SimulateConfig:
-    """Which suite is simulated, and where to; `benchmark` holds the settings of a `Suite`."""
+    """The suite that is simulated (settings of `tagjax.sim.suites.Suite`), and the folder for its recordings."""
 
-    benchmark: Mapping[str, Any]
-    out: str = "recordings/benchmark"
+    suite: Mapping[str, Any]
+    recordings_dir: str = "recordings"
     smoke: bool = False
-    workers: int | None = None
+    workers: int | None = None  # processes; as many as there are cores if None
     progress: bool = True
+    sheet: str | None = None  # a folder for a contact sheet; no recordings are then made
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
-            raise ValueError(f"workers is {self.workers}; expected at least 1 process.")
+            raise ConfigError(f"workers is {self.workers}; expected at least 1 process.")

@@ -1,6 +1,7 @@
-"""Learned tracer parameters as plain numbers: one JSON file with the settings they began from and the recipe.
+"""Learned tracer parameters as plain numbers: one JSON file with the tracer's settings, the clip settings and the recipe.
 
-Nothing in a file is executed: it names numbers, which take the place of parameters that the tracer has already.
+Nothing in a file is executed: it names numbers, which take the place of parameters that the tracer has already, and the
+clip settings of the training, with which the tracer is evaluated unless others are given.
 """
 
 from __future__ import annotations
@@ -20,8 +21,11 @@ PACKAGED = Path(__file__).parent / "weights"
 """Where the parameters that come with the package lie, as <name>.json."""
 
 _FORMAT = "tagjax-tracer-parameters"
-_VERSION = 1
+_VERSION = 2
 _LONGEST_TEXT = 1_000_000
+
+CLIP_NAMES = ("stride", "window", "flow", "estimator", "antennas")
+"""Clip settings that change a tracer's results; `max_reads` and `length` are sizes of buffers."""
 
 
 def packaged_parameters() -> tuple[str, ...]:
@@ -29,19 +33,44 @@ def packaged_parameters() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in PACKAGED.glob("*.json")))
 
 
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """A file of learned parameters."""
+
+    path: Path
+    settings: Mapping[str, Any]  # of the tracer, with the values that learning began from
+    clips: Mapping[str, Any]  # clip settings of the training: stride, window, flow, estimator, antennas
+    parameters: Mapping[str, float]  # in physical units
+    default: bool  # whether `default` may mean this file
+
+    def unmoved(self) -> set[str]:
+        """Parameters that still have the value that learning began from."""
+        began = self.settings
+        return {name for name, value in self.parameters.items() if name in began and value == began[name]}
+
+
 def save_parameters(
-    path: str | Path, tracer: TagAttention, settings: Mapping[str, Any], about: Mapping[str, Any] | None = None
+    path: str | Path,
+    tracer: TagAttention,
+    settings: Mapping[str, Any],
+    clips: Mapping[str, Any],
+    about: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a tracer's parameters in physical units.
 
-    `settings` are those that the tracer was built with, as under conf/tracer; `about` is the writer's: recipe, seed,
-    data, scores.
+    `settings` are those that the tracer was built with, as under conf/tracer. `clips` are the clip settings of its training
+    that change its results (`CLIP_NAMES`); a flow in a file beside `path` is named relative to it. `about` is for people:
+    recipe, seed, data, scores.
     """
     path = Path(path)
+    chosen = {name: clips[name] for name in CLIP_NAMES if name in clips}
+    if isinstance(flow := chosen.get("flow"), str) and Path(flow).parent == path.parent:
+        chosen["flow"] = Path(flow).name
     content = {
         "format": _FORMAT,
         "version": _VERSION,
-        "settings": dict(settings),
+        "settings": _parameters_only(settings),
+        "clips": chosen,
         "parameters": tracer.physical(),
         "about": dict(about or {}),
     }
@@ -50,40 +79,44 @@ def save_parameters(
     os.replace(beside, path)
 
 
-def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[str, Any]) -> TagAttention:
-    """The tracer with learned parameters in place of its own.
+def read_learned(source: str | Path, settings: Mapping[str, Any] | None = None) -> Learned:
+    """A file of `save_parameters`, packaged parameters by name, or `default`.
 
-    `source` is a file of `save_parameters`, the name of packaged parameters, or `default`: those that were learned from
-    these very `settings` (of several packaged ones all but one say `"default": false`, and are given by name). Raises `ValueError` where there are none, for a file that is damaged, foreign, or of
-    another tracer, and where `settings` ask for other initial values than it was learned from; of a parameter that did
-    not move in learning any value may be asked for.
+    `default` means the packaged parameters that were learned from these tracer `settings`; without settings, those that are
+    the package's default. Raises `ValueError` where there are none, and for a file that is damaged or of another kind.
     """
-    path = _default_for(settings) if str(source) == "default" else _find(source)
-    content = _read(path)
-    learned = dict(content["parameters"])
+    return _default_for(settings) if str(source) == "default" else _read(_find(source))
+
+
+def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[str, Any]) -> TagAttention:
+    """The tracer with learned parameters in place of its own; `source` and errors as of `read_learned`.
+
+    Raises `ValueError` also for parameters of another tracer, and where `settings` ask for other initial values than the
+    learning began from. A parameter that learning left unchanged may have any value.
+    """
+    found = read_learned(source, settings)
+    learned, unmoved = dict(found.parameters), found.unmoved()
     for name, default in _learnable(tracer).items():
-        began, asked = (given.get(name, default) for given in (content["settings"], settings))
-        if asked != began and name in _unmoved(content):
+        began, asked = (given.get(name, default) for given in (found.settings, settings))
+        if asked != began and name in unmoved:
             learned[name] = asked
         elif asked != began:
             raise ValueError(
-                f"{path}: learned from {name}={began!r}, and what was learned takes its place, but {name}={asked!r} is "
-                f"asked for: leave {name} as it was, or weights= out."
+                f"{found.path}: found tracer.{name}={asked!r}; expected {began!r}, from which these parameters were learned: "
+                f"the learned value would replace yours. Leave out {name}, or weights=."
             )
     try:
         return tracer.with_physical(learned)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{found.path}: {error}") from error
 
 
-def _unmoved(content: Mapping[str, Any]) -> set[str]:
-    """Parameters of a file that are what learning began from."""
-    began = content["settings"]
-    return {name for name, value in content["parameters"].items() if name in began and value == began[name]}
+def _parameters_only(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name != "clips"}
 
 
 def _learnable(tracer: TagAttention) -> dict[str, Any]:
-    """The arguments that a tracer learns, which are not static, with their defaults."""
+    """The arguments of a tracer that are learned, with their defaults."""
     static = {field.name for field in dataclasses.fields(tracer) if field.metadata.get("static", False)}
     arguments = inspect.signature(type(tracer)).parameters.values()
     return {argument.name: argument.default for argument in arguments if argument.name not in static}
@@ -101,22 +134,26 @@ def _find(source: str | Path) -> Path:
     )
 
 
-def _default_for(settings: Mapping[str, Any]) -> Path:
-    for name in packaged_parameters():
-        path = PACKAGED / f"{name}.json"
-        content = _read(path)
-        free = _unmoved(content)
-        began, asked = ({k: v for k, v in one.items() if k not in free} for one in (content["settings"], settings))
-        if content.get("default", True) and began == asked:
-            return path
+def _default_for(settings: Mapping[str, Any] | None) -> Learned:
+    found = [one for name in packaged_parameters() if (one := _read(PACKAGED / f"{name}.json")).default]
+    for one in found:
+        if settings is None:
+            return one
+        unmoved = one.unmoved()
+        began, asked = (
+            {name: value for name, value in each.items() if name not in unmoved}
+            for each in (one.settings, _parameters_only(settings))
+        )
+        if began == asked:
+            return one
     there = ", ".join(packaged_parameters()) or "none"
     raise ValueError(
-        f"No packaged parameters were learned from these settings of {settings.get('_target_')} (there are: {there}). "
-        "Leave the settings as they come, or give the name or a file."
+        f"weights=default: no packaged parameters were learned from these settings of {(settings or {}).get('_target_')} "
+        f"(packaged are: {there}). Leave the settings at their defaults, or give a name or a file."
     )
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> Learned:
     try:
         if path.stat().st_size > _LONGEST_TEXT:
             raise ValueError(f"{path.stat().st_size} bytes")
@@ -124,16 +161,19 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: no learned parameters ({type(error).__name__}: {error}).") from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
-        raise ValueError(f"{path}: JSON, but no learned parameters ({_FORMAT}).")
+        raise ValueError(f"{path}: found JSON, but no learned parameters; expected the format {_FORMAT}.")
     if content.get("version") != _VERSION:
         raise ValueError(f"{path}: version {content.get('version')!r}; this release reads {_VERSION}. Train again.")
-    numbers = content.get("parameters")
-    if not isinstance(numbers, dict) or not isinstance(content.get("settings"), dict):
-        raise ValueError(f"{path}: holds no parameters or no settings. Copy the file again.")
-    wrong = [name for name, value in numbers.items() if not _is_number(value)]
+    parts = [content.get(name) for name in ("settings", "clips", "parameters")]
+    if not all(isinstance(part, dict) for part in parts):
+        raise ValueError(f"{path}: no settings, clips or parameters found; expected all three. Copy the file again.")
+    wrong = [name for name, value in content["parameters"].items() if not _is_number(value)]
     if wrong:
         raise ValueError(f"{path}: {', '.join(wrong)}: not a finite number. Train again.")
-    return content
+    clips = dict(content["clips"])
+    if isinstance(flow := clips.get("flow"), str) and (path.parent / flow).is_file():
+        clips["flow"] = str(path.parent / flow)
+    return Learned(path, content["settings"], clips, content["parameters"], content.get("default", True))
 
 
 def _is_number(value: Any) -> bool:

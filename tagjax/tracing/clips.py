@@ -240,29 +240,29 @@ _window_reads = jax.jit(window_reads, static_argnums=(2, 3))
 class ClipSettings:
     """How recordings become clips."""
 
-    stride: int = 4  # every n-th pixel in both directions is kept
+    stride: int = 4  # every n-th pixel in both directions
     window: int = 5  # frames in a motion vector (k)
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
-    estimator: Estimator = "robust"  # of the tags' ranges
-    antennas: Antennas = None  # `all`, numbers from 1, or the antenna with the most reads if None
+    estimator: Estimator = "robust"  # of the tags' distances
+    antennas: Antennas = None  # distances are to these: `all`, numbers from 1, or the one with the most reads if None
     length: int = 24  # frames of a training clip
-    epcs: tuple[str, ...] | None = None  # all tags that were read if None
-    least_motion: float = 0.1  # training clips in which no tag is heard to move by so much are not drawn; 0 draws all
-    most_tags: int | None = None  # of a training clip: the one that moves most, others by chance; all if None
-    workers: int = 0  # processes that load training clips; with none a thread does
+    epcs: tuple[str, ...] | None = None  # all that were read
+    min_motion: float = 0.1  # training clips without a tag whose reads show so much motion are not drawn; 0 draws all
+    max_tags: int | None = None  # of a training clip: the tag that moves most, others at random; all if None
+    workers: int = 0  # processes that load training clips; with 0 a thread does
 
     def __post_init__(self) -> None:
         check_clip(stride=self.stride, window=self.window, max_reads=self.max_reads)
         if self.length < self.window:
-            raise ValueError(f"length is {self.length}; expected at least the window's {self.window} frames.")
-        if not 0 <= self.least_motion < 1:
-            raise ValueError(f"least_motion is {self.least_motion}; expected a share of coherence, 0 to less than 1.")
-        if self.most_tags is not None and self.most_tags < 1:
-            raise ValueError(f"most_tags is {self.most_tags}; expected at least 1 tag, or null for all.")
+            raise ConfigError(f"length is {self.length}; expected at least the window's {self.window} frames.")
+        if not 0 <= self.min_motion < 1:
+            raise ConfigError(f"min_motion is {self.min_motion}; expected a loss of coherence, from 0 to less than 1.")
+        if self.max_tags is not None and self.max_tags < 1:
+            raise ConfigError(f"max_tags is {self.max_tags}; expected at least 1 tag, or null for all.")
 
     def arguments(self) -> dict[str, Any]:
-        """What `load_clip` and `clip_dataset` both take, by name."""
+        """The arguments that `load_clip` and `clip_dataset` both have, by name."""
         names = ("stride", "flow", "window", "max_reads", "estimator", "antennas")
         return {name: getattr(self, name) for name in names}
 

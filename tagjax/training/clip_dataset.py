@@ -51,18 +51,18 @@ def motion_heard(
     return most
 
 
-def _drawn_tags(heard: np.ndarray, most_tags: int | None, seed: tuple[int, ...]) -> list[int]:
+def _drawn_tags(heard: np.ndarray, max_tags: int | None, seed: tuple[int, ...]) -> list[int]:
     """The number of the tag that is heard to move most, and of the others as many as there is room for, by chance."""
     moving = int(heard.argmax())
     others = np.random.default_rng(seed).permutation(np.delete(np.arange(len(heard)), moving))
-    return sorted([moving, *others.tolist()][:most_tags])
+    return sorted([moving, *others.tolist()][:max_tags])
 
 
 class _ClipSource:
     """Every clip of `length` frames that starts on a multiple of `step`, as Grain's random access source.
 
-    Of these only clips in which the radio hears some tag move, by `least_motion` or more (`motion_heard`), each with
-    `most_tags` of its tags. Warns (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for those
+    Of these only clips in which the radio hears some tag move, by `min_motion` or more (`motion_heard`), each with
+    `max_tags` of its tags. Warns (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for those
     of which no clip can be loaded, which would else be found when the first one is drawn.
     """
 
@@ -73,8 +73,8 @@ class _ClipSource:
         step: int,
         on_host: bool,
         epcs: Sequence[str] | None = None,
-        least_motion: float = 0.0,
-        most_tags: int | None = None,
+        min_motion: float = 0.0,
+        max_tags: int | None = None,
         **settings: Any,
     ):
         self._recordings, self._length, self._settings = list(recordings), length, settings
@@ -104,15 +104,15 @@ class _ClipSource:
             starts = range(0, recording.num_frames - length + 1, step)
             heard = motion_heard(recording, starts, length, named, chosen)
             for start, of_tags in zip(starts, heard, strict=True):
-                if of_tags.max() >= least_motion:
-                    drawn = _drawn_tags(of_tags, most_tags, (number, start))
+                if of_tags.max() >= min_motion:
+                    drawn = _drawn_tags(of_tags, max_tags, (number, start))
                     self._places.append((number, start, tuple(named[tag] for tag in drawn), chosen))
             most_heard = max(most_heard, float(heard.max()))
         if not self._places:
             raise RecordingError(
-                f"In no clip of {length} frames is a tag heard to move by {least_motion} or more (the most is "
+                f"In no clip of {length} frames is a tag heard to move by {min_motion} or more (the most is "
                 f"{most_heard:.3f}; noise alone makes about 0.02): there is nothing to learn motion from. Give recordings "
-                "in which tags move and are read, or set data.clips.least_motion lower."
+                "in which tags move and are read, or set data.clips.min_motion lower."
             )
 
     def __len__(self) -> int:
@@ -143,16 +143,16 @@ def clip_dataset(
     antennas: Antennas = None,
     colour: bool = False,
     step: int | None = None,
-    least_motion: float = 0.0,
-    most_tags: int | None = None,
+    min_motion: float = 0.0,
+    max_tags: int | None = None,
     workers: int = 0,
     share: tuple[int, int] = (0, 1),
 ) -> Stream:
     """An endless, shuffled stream of clips; the same seed gives the same order.
 
     Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None);
-    those in which no tag is heard to move by `least_motion` (`motion_heard`) are not drawn, and of a clip's tags
-    `most_tags` are, all if None: the one that is heard to move most and some of the others, the same each time. With
+    those in which no tag is heard to move by `min_motion` (`motion_heard`) are not drawn, and of a clip's tags
+    `max_tags` are, all if None: the one that is heard to move most and some of the others, the same each time. With
     `workers` as many processes load them, radio included, and this one only takes them to its device; `share` (i, n) is
     every n-th clip from the i-th on. Warns (`RecordingWarning`) of recordings shorter than a clip; raises
     `RecordingError` if all are, and for an unknown EPC or antenna of any other; `ValueError` for settings that no clip
@@ -162,7 +162,7 @@ def clip_dataset(
     for name, found, unit in (
         ("clip_length", clip_length, "frame"),
         ("step", step, "frame"),
-        ("most_tags", most_tags, "tag"),
+        ("max_tags", max_tags, "tag"),
     ):
         if found is not None and found < 1:
             raise ValueError(f"{name} is {found}; expected at least 1 {unit}.")
@@ -172,8 +172,8 @@ def clip_dataset(
         step or max(1, clip_length // 2),
         workers > 0,
         epcs,
-        least_motion,
-        most_tags,
+        min_motion,
+        max_tags,
         stride=stride,
         flow=flow,
         window=window,

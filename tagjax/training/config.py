@@ -17,19 +17,19 @@ from .sources import DataSettings
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """Everything of a training run."""
+    """All settings of a training run."""
 
     tracer: Mapping[str, Any]
     optimizer: Mapping[str, Any]
-    weights: str | None = (
-        None  # learned parameters to begin with: `default`, a name, or a file (tagjax.tagattention.learned)
-    )
+    weights: str | None = None  # learned parameters to begin with: `default`, a name, or a file (tagjax.tagattention.learned)
     baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside it
-    baseline_estimators: Mapping[str, str] = dataclasses.field(default_factory=dict)  # where not the clips' own
+    baseline_estimators: Mapping[str, str] = dataclasses.field(
+        default_factory=dict
+    )  # of a baseline, where not the clips'
     seed: int = 0
     clip_norm: float = 1.0
-    resume: bool = True  # go on from the run folder's newest checkpoint, if it holds one
-    retune: bool = False  # then with another clip_norm or optimiser than it was begun with
+    resume: bool = True  # from the run folder's newest checkpoint, if it holds one
+    retune: bool = False  # a resumed run may have another clip_norm and other numbers of its optimiser
     joint: JointSettings | None = None  # without it flow is `data.clips.flow`, computed once
     data: DataSettings = dataclasses.field(default_factory=DataSettings)
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)

@@ -16,7 +16,7 @@ from .processes import DistributedSettings
 
 @dataclasses.dataclass(frozen=True)
 class TrainFlowConfig:
-    """Everything of a run that trains a flow network."""
+    """All settings of a training run of a flow network."""
 
     flow: Mapping[str, Any]
     optimizer: Mapping[str, Any]

@@ -15,8 +15,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from ..core.build import build
 from ..core.machine import machine
-from ..core.settings import build
 from ..flow.estimates import NetworkFlow, one_way
 from ..flow.losses import FlowLossSettings
 from ..flow.named import make_flow

@@ -53,7 +53,7 @@ class FlowDataSettings:
 
     drawn: DrawnSettings = dataclasses.field(default_factory=DrawnSettings)
     sequences: tuple[str, ...] = ()  # recordings, videos, folders of pictures: never labelled
-    sequence_share: float = 0.5  # of the samples, all sequences together; the rest is drawn
+    sequence_fraction: float = 0.5  # of the samples, all sequences together; the rest is drawn
     variation: VariationSettings = dataclasses.field(default_factory=VariationSettings)
     teacher: str | None = None  # a flow by name, whose word is all that is learned from
     cuts_per_sequence: int = 24  # pairs of the drawn ones' size that the teacher is asked for
@@ -62,8 +62,8 @@ class FlowDataSettings:
     def __post_init__(self) -> None:
         if self.cuts_per_sequence < 1:
             raise ValueError(f"cuts_per_sequence is {self.cuts_per_sequence}; expected at least 1.")
-        if not 0 < self.sequence_share <= 1:
-            raise ValueError(f"sequence_share is {self.sequence_share}; expected a share above 0 and at most 1.")
+        if not 0 < self.sequence_fraction <= 1:
+            raise ValueError(f"sequence_fraction is {self.sequence_fraction}; expected a share above 0 and at most 1.")
         if self.drawn.num_pairs < 1 and not self.sequences:
             raise ValueError("Nothing to learn from: drawn.num_pairs is 0 and no sequences are named.")
 
@@ -148,7 +148,7 @@ def flow_dataset(
     """The endless stream of varied pairs that the settings describe, or a share of it; with the teacher's flow, if any."""
     sequences = [open_sequence(path, Path(settings.drawn.folder)) for path in settings.sequences]
     lengths = [sequence.shape[0] for sequence in sequences]
-    whole = settings.sequence_share if settings.drawn.num_pairs else 1.0
+    whole = settings.sequence_fraction if settings.drawn.num_pairs else 1.0
     sources: list[PairSource | StackedPairs | TaughtPairs] = []
     for number, sequence in enumerate(sequences):
         if settings.teacher is None:

@@ -105,7 +105,7 @@ def save_network(path: Path, model: JointModel, settings: Mapping[str, Any]) -> 
 
 @dataclasses.dataclass(frozen=True)
 class JointSettings:
-    """A flow network that learns with the tracer."""
+    """A flow network that is learned with the tracer."""
 
     flow: Mapping[str, Any]
     optimizer: Mapping[str, Any]
@@ -118,4 +118,6 @@ class JointSettings:
         if self.weight < 0:
             raise ConfigError(f"weight is {self.weight}; expected 0 or more.")
         if self.loss.self_supervision > 0:
-            raise ConfigError("loss.self_supervision is of experiments.train_flow only; expected 0.")
+            raise ConfigError(
+                "loss.self_supervision is above 0, which only experiments.train_flow supports; expected 0."
+            )

@@ -13,12 +13,14 @@ import optax
 from rich.console import Console
 from rich.progress import track
 
-from ..core.settings import ConfigError, build
+from ..core.build import build
+from ..core.settings import ConfigError
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
 from ..report.report import plain, score_table, write_json, write_report
 from ..tagattention import TagAttention
-from ..tagattention.learned import load_parameters, save_parameters
+from ..tagattention.learned import save_parameters
+from ..tagattention.tracer_settings import make_tracer
 from ..tracing.clips import Antennas, Clip, ClipSettings, clip_loader
 from ..tracing.tracer import AbstractTracer
 from .checkpoint import Checkpoints
@@ -34,21 +36,6 @@ from .state import TrainState
 from .step import clip_loss, make_joint_optimizer, make_optimizer, train_step
 
 VALIDATION_CLIPS = 2
-
-
-def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> AbstractTracer:
-    """The tracer that the settings name, with learned parameters if `weights` says which (`load_parameters`).
-
-    Raises `ValueError` if the settings name something else, or a tracer for which there are none.
-    """
-    tracer = build(settings, where="tracer")
-    if not isinstance(tracer, AbstractTracer):
-        raise ValueError(f"tracer: {settings['_target_']} is no tracer; expected a subclass of AbstractTracer.")
-    if weights is None:
-        return tracer
-    if not isinstance(tracer, TagAttention):
-        raise ValueError(f"weights={weights}: learned parameters are of TagAttention; {settings['_target_']} has none.")
-    return load_parameters(tracer, weights, settings)
 
 
 def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
@@ -136,8 +123,8 @@ def _train(
             clip_length=clips.length,
             seed=config.seed,
             epcs=clips.epcs,
-            least_motion=clips.least_motion,
-            most_tags=clips.most_tags,
+            min_motion=clips.min_motion,
+            max_tags=clips.max_tags,
             workers=clips.workers,
             share=(jax.process_index(), jax.process_count()),
             colour=config.joint is not None,
@@ -195,7 +182,9 @@ def _keep_learned(
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
     if isinstance(tracers["learned"], TagAttention):
         recipe = dataclasses.asdict(config) | {"steps": int(state.step)}
-        save_parameters(folder / "weights.json", tracers["learned"], config.tracer, plain({"recipe": recipe}))
+        clips = dataclasses.asdict(config.data.clips) | {"flow": flows["learned"]}
+        about = plain({"recipe": recipe})
+        save_parameters(folder / "weights.json", tracers["learned"], config.tracer, plain(clips), about)
     write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
     return tracers, flows
 

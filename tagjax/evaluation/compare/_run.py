@@ -34,34 +34,38 @@ _STILL_M = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class CompareConfig:
-    """Which systems meet on which suites. `suites` are those of `conf/benchmark`, as their files say."""
+    """The systems and the suites; `suites` has the settings of each by name, as in the files of conf/suite."""
 
     suites: Mapping[str, Mapping[str, Any]]
     systems: SystemSettings
     only: tuple[str, ...] = NAMES
-    out: str = "recordings/benchmark"
+    recordings_dir: str = "recordings"
     split: str = "test"
-    most: int | None = None  # recordings of each variant; all if None
+    max_recordings: int | None = None  # of each variant; all if None
     smoke: bool = False
     workers: int = 1
-    papers: Mapping[str, Mapping[str, str]] = dataclasses.field(
+    published: Mapping[str, Mapping[str, str]] = dataclasses.field(
         default_factory=dict
-    )  # by suite and system: its paper's
+    )  # figures of the papers, by suite and system
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 
     def __post_init__(self) -> None:
         if not self.suites:
-            raise ConfigError("No suite to compare on: benchmark=[single_static,planar_tracks], for example.")
+            raise ConfigError(
+                "suites is empty; expected names of suites, for example suites=[single_static,planar_tracks]."
+            )
         if unknown := sorted(set(self.only) - set(NAMES)):
             raise ConfigError(f"Unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)}.")
-        if unknown := sorted({name for of in self.papers.values() for name in of} - set(NAMES)):
+        if unknown := sorted({name for of in self.published.values() for name in of} - set(NAMES)):
             raise ConfigError(
-                f"papers: unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)} below each suite."
+                f"published: unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)} below each suite."
             )
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
-        if self.most is not None and self.most < 1:
-            raise ConfigError(f"most is {self.most}; expected at least 1 recording of each variant.")
+        if self.max_recordings is not None and self.max_recordings < 1:
+            raise ConfigError(
+                f"max_recordings is {self.max_recordings}; expected at least 1 recording of each variant."
+            )
 
 
 @dataclasses.dataclass
@@ -83,10 +87,10 @@ def run_comparison(
     folder.mkdir(parents=True, exist_ok=True)
     systems, cells = Systems(config.systems, config.scores), list[Cell]()
     for name, values in config.suites.items():
-        items = _items(config, from_mapping(Suite, values, where=f"benchmark {name}"), tell)
+        items = _items(config, from_mapping(Suite, values, where=f"suite {name}"), tell)
         for system in config.only:
             cell = _cell(systems, system, name, items, config, tell)
-            cells.append(dataclasses.replace(cell, paper=config.papers.get(name, {}).get(system)))
+            cells.append(dataclasses.replace(cell, paper=config.published.get(name, {}).get(system)))
         _write(folder, cells)
     return cells
 
@@ -96,9 +100,9 @@ def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> 
 
     items = make_items(
         suite,
-        Path(config.out),
+        Path(config.recordings_dir),
         splits=(config.split,),
-        max_per_variant=config.most,
+        max_per_variant=config.max_recordings,
         workers=config.workers,
         on_done=lambda one: tell(f"simulated {one.name}"),
     )
@@ -115,7 +119,7 @@ def _cell(
     tally, reason = _Tally(), None
     for item in items:
         tell(f"{system}: {item.name}")
-        recording = open_recording(item.path(Path(config.out)))
+        recording = open_recording(item.path(Path(config.recordings_dir)))
         try:
             _score(systems, system, item, recording, config.scores, tally)
         except (RecordingError, ValueError) as error:

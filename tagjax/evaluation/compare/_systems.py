@@ -16,10 +16,10 @@ from ...metrics.recordings import ScoreSettings
 from ...recording import Recording, RecordingError
 from ...recording.store import open_recording
 from ...sim.suites import Item
-from ...tracing.clips import ClipSettings, clip_loader
+from ...tagattention.tracer_settings import make_tracer, tracer_clips
+from ...tracing.clips import clip_loader
 from ...tracing.recordings import trace_recording
 from ...tracing.tracer import AbstractTracer, Trace
-from ...training.run import make_tracer
 from ..tagvision import CalibrationSettings, calibrated, table_truth
 
 Traces = Iterator[tuple[int, Trace]]
@@ -35,20 +35,14 @@ DEVICE = NAMES[:2]
 
 
 @dataclasses.dataclass(frozen=True)
-class TracerSettings:
-    """One way to set TagAttention: the tracer by `_target_`, and the clips that it sees."""
-
-    tracer: Mapping[str, Any]
-    clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
-
-
-@dataclasses.dataclass(frozen=True)
 class SystemSettings:
     """The settings of every system. TagAttention has several, by name; which a suite takes follows from its story."""
 
-    tagattention: Mapping[str, TracerSettings] = dataclasses.field(default_factory=dict)
+    tagattention: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # as under conf/tracer
     settings_of: Mapping[str, str] = dataclasses.field(default_factory=dict)  # story to a name in `tagattention`
-    tagattention_paper: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # the tracer; clips as beside it
+    tagattention_paper: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # on the same clips as `tagattention`
     tagvision: TagVisionSettings = dataclasses.field(default_factory=TagVisionSettings)
     tagvision_calibration: CalibrationSettings = dataclasses.field(default_factory=CalibrationSettings)
     tagview: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
@@ -103,7 +97,7 @@ class Systems:
     def stride(self, name: str, item: Item) -> int:
         """Every how many pixels a system's masks have one."""
         way = self.chosen(name, item)
-        return 1 if way is None else self.settings.tagattention[way].clips.stride
+        return 1 if way is None else tracer_clips(self.settings.tagattention[way]).stride
 
     def traces(self, name: str, item: Item, recording: Recording, epcs: list[str]) -> Traces:
         """Frame numbers and traces. Raises `RecordingError` or `ValueError` where the method cannot apply."""
@@ -125,10 +119,11 @@ class Systems:
 
     def _device(self, name: str, way: str, recording: Recording, epcs: list[str]) -> Traces:
         settings, paper = self.settings.tagattention[way], name == "tagattention_paper"
-        clips = dataclasses.replace(settings.clips, estimator="paper") if paper else settings.clips
+        clips = tracer_clips(settings)
+        clips = dataclasses.replace(clips, estimator="paper") if paper else clips
         key = name, None if paper else way
         if key not in self._tracers:
-            self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings.tracer)
+            self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings)
         tracer = self._tracers[key]
         return trace_recording(
             tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.supported_by(tracer)
@@ -161,7 +156,7 @@ class Systems:
             if grid is None or not Path(grid).exists():
                 raise RecordingError(
                     f"antennas not calibrated: systems.goller_grid names no recording of a tag grid ({grid}); "
-                    "`python -m experiments.simulate benchmark=shop_grid` makes one"
+                    "`python -m experiments.simulate suite=shop_grid` makes one"
                 )
             self._calibration = calibrate(open_recording(Path(grid)))
         return GollerTracer(self._calibration, self.settings.goller).at(recording)

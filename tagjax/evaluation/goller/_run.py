@@ -64,7 +64,7 @@ class GollerConfig:
     fit_means: bool = False
     fit_steps: int = 120  # 0 keeps the starting values
     learning_rate: float = 0.05
-    most: int | None = None  # recordings of a variant in each split; all if None
+    max_recordings: int | None = None  # of each variant and split; all if None
 
 
 def scenario_paths(folder: Path, split: str, most: int | None = None) -> list[tuple[str, Path]]:
@@ -96,14 +96,14 @@ def _there(recording: str) -> bool:
 
 def _check_paths(config: GollerConfig) -> None:
     """Raises `ValueError` that names all that is missing of the recordings, and the commands that make them."""
-    told, home = [], "recordings/benchmark"
-    made = "`python -m experiments.simulate benchmark={0}` makes {1}/{0}"
+    told, home = [], "recordings"
+    made = "`python -m experiments.simulate suite={0}` makes {1}/{0}"
     if not _there(config.grid):
         told.append(
             f"grid={config.grid}: no such recording of a tag grid; {made.format('shop_grid', home)}/train/*.zarr."
         )
     folder = Path(config.scenarios)
-    if empty := [split for split in SPLITS if not scenario_paths(folder, split, config.most)]:
+    if empty := [split for split in SPLITS if not scenario_paths(folder, split, config.max_recordings)]:
         told.append(
             f"scenarios={folder}: no recording in {', '.join(f'{split}/' for split in empty)}; expected some in each of a "
             f"suite's folders; {made.format('shop_exit', home)}."
@@ -138,7 +138,7 @@ def run_goller(
     splits: dict[str, list[Example]] = {}
     for split in SPLITS:
         splits[split] = []
-        for variant, path in scenario_paths(Path(config.scenarios), split, config.most):
+        for variant, path in scenario_paths(Path(config.scenarios), split, config.max_recordings):
             recording = open_recording(str(path))
             splits[split].append((variant, observe(recording, settings), carried(recording)))
             num_frames += recording.num_frames

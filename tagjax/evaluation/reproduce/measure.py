@@ -15,9 +15,10 @@ from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recor
 from ...recording.store import open_recording
 from ...report.report import plain, write_json
 from ...sim.suites import Item, Suite, make_items
+from ...tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
-from ...training.run import make_tracer, parameters
+from ...training.run import parameters
 from .recipe import Job, Recipe
 from .scores import RecordingScores
 
@@ -117,8 +118,12 @@ def _tracing(recipe: Recipe, inputs: Inputs, job: Job) -> Tracing:
     system, protocol = recipe.systems[job.system], recipe.protocols[job.protocol]
     settings = _named("tracer", system.tracer, inputs.tracers)
     scores = changed(ScoreSettings(num_pictures=0), {**protocol.scores, **system.scores}, where="scores")
-    clips = changed(ClipSettings(), system.clips, where="clips")
-    return Tracing(make_tracer(settings, system.weights), settings, clips, scores, protocol.frames)
+    if system.weights is None:
+        tracer, clips = make_tracer(settings), tracer_clips(settings)
+    else:
+        tracer, clips = learned_tracer(system.weights, settings)
+    clips = changed(clips, system.clips, where="clips")
+    return Tracing(tracer, settings, clips, scores, protocol.frames)
 
 
 def _draw(job: Job) -> tuple[str, str, tuple[int, ...] | None]:

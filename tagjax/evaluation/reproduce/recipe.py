@@ -28,7 +28,11 @@ MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "f
 
 @dataclasses.dataclass(frozen=True)
 class System:
-    """A tracer as it is measured. `clips` and `scores` hold what differs from the defaults and from the protocol."""
+    """A tracer as it is measured.
+
+    `clips` holds what differs from the clips of the weights or of the tracer's settings, `scores` what differs from the
+    protocol.
+    """
 
     tracer: str  # the name of its settings in conf/tracer
     weights: str | None = None  # learned parameters: `default`, a name, or a file

@@ -57,22 +57,24 @@ class DetectorTraining:
 class TagviewExperiment:
     """What is run, on recordings that `experiments.simulate` has made."""
 
-    recordings: str = "recordings/benchmark"
+    recordings_dir: str = "recordings"
     suites: tuple[str, ...] = ()
     split: str = "test"
-    most: int | None = None  # recordings of a variant; all if None
+    max_recordings: int | None = None  # of each variant; all if None
     system: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
     matching: Mapping[str, Matching] = dataclasses.field(default_factory=dict)
-    whole: str = "tagview"  # the one of them that the paper's figures stand beside
+    complete: str = "tagview"  # the entry of `matching` that is set beside the paper's figures
     training: DetectorTraining = dataclasses.field(default_factory=DetectorTraining)
 
     def __post_init__(self):
         if self.split not in SPLITS:
             raise ValueError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
         if not self.suites:
-            raise ValueError("suites is empty; expected names of suites under `recordings`.")
-        if self.whole not in self.matching:
-            raise ValueError(f"whole is {self.whole!r}; expected one of {', '.join(self.matching) or 'none given'}.")
+            raise ValueError("suites is empty; expected names of suites under `recordings_dir`.")
+        if self.complete not in self.matching:
+            raise ValueError(
+                f"complete is {self.complete!r}; expected one of {', '.join(self.matching) or 'none given'}."
+            )
 
 
 def find_recordings(root: str, suite: str, split: str, most: int | None = None) -> list[tuple[str, Path]]:
@@ -85,7 +87,7 @@ def find_recordings(root: str, suite: str, split: str, most: int | None = None) 
             found.append((group, int(parts[3]), path))
     if not found:
         raise ValueError(
-            f"{root}/{suite}/{split}: no recording. `python -m experiments.simulate benchmark={suite} out={root}` makes some."
+            f"{root}/{suite}/{split}: no recording. `python -m experiments.simulate suite={suite} paths.recordings_dir={root}` makes some."
         )
     order = {group: place for place, group in enumerate(_by_count({group for group, _, _ in found}))}
     return [(group, path) for group, _, path in sorted(found, key=lambda one: (order[one[0]], one[1]))]
@@ -108,7 +110,9 @@ def run_tagview(
     """
     folder.mkdir(parents=True, exist_ok=True)
     todo = [
-        one for suite in config.suites for one in find_recordings(config.recordings, suite, config.split, config.most)
+        one
+        for suite in config.suites
+        for one in find_recordings(config.recordings_dir, suite, config.split, config.max_recordings)
     ]
     tracer = TagviewTracer(dataclasses.replace(config.system, memory_s=1e9))
     found: dict[str, dict[str, list[Judged]]] = {}
@@ -129,7 +133,7 @@ def run_tagview(
         if number == 0:
             track_plot(folder / "tracks.png", seen, np.asarray(recording.colour[0]))
     metrics = _metrics(config, found, float(np.mean(pixel_mm)), rows)
-    whole = [one for group in found.values() for one in group[config.whole]]
+    whole = [one for group in found.values() for one in group[config.complete]]
     pair_plot(folder / "pairs.png", [one for one in whole if not one.recording.startswith("half_wavelength")])
     accuracy = accuracy_by_tags(found)
     if accuracy:
@@ -181,13 +185,13 @@ def _metrics(
         groups["ceiling, all"] = {
             name: summarise([one for group in tables for one in found[group][name]]) for name in config.matching
         }
-    whole = [one for settings in found.values() for one in settings[config.whole]]
+    whole = [one for settings in found.values() for one in settings[config.complete]]
     errors = np.concatenate([one.error_px for one in whole])
     like = [one for one in whole if not one.recording.startswith("half_wavelength")]
     error_px, std_px = (float(x) if len(errors) else 0.0 for x in (errors.mean(), errors.std()))
     return {
         "paper": PAPER,
-        "whole": config.whole,
+        "complete": config.complete,
         "groups": groups,
         "tracking": {"error_px": error_px, "std_px": std_px, "error_mm": error_px * mm_px, "height_px": rows},
         "pairs": {kind: quartiles(like, kind) for kind in ("r_squared", "slope")},
@@ -216,7 +220,7 @@ def train_tagview(
     training, settings = config.training, config.training.recipe
     frames, measured, used = [], [], {}
     for suite in config.suites:
-        paths = find_recordings(config.recordings, suite, "train", config.most)
+        paths = find_recordings(config.recordings_dir, suite, "train", config.max_recordings)
         used[suite] = len(paths)
         for _, path in paths:
             frames += labelled_frames(open_recording(path), every=settings.every, least_side_px=settings.least_side_px)

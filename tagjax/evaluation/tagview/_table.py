@@ -65,7 +65,7 @@ def table(metrics: Mapping[str, Any]) -> str:
     ]
     for group, settings in metrics["groups"].items():
         for name, one in settings.items():
-            theirs = PAPER_GROUPS.get(group, {}) if name == metrics["whole"] else {}
+            theirs = PAPER_GROUPS.get(group, {}) if name == metrics["complete"] else {}
             cells = [_cell(one[kind], theirs.get(kind)) for kind in ("accuracy", "precision", "recall")]
             rows.append(f"| {group} | {name} | {one['num_recordings']} | {one['num_traces']} | {' | '.join(cells)} |")
     rows += [

@@ -26,10 +26,10 @@ PAPER = {"blob_matching": 0.98, "tracking_error_mm": 10.33, "transform_error_mm"
 
 @dataclasses.dataclass(frozen=True)
 class TagVisionExperiment:
-    """What is run. `benchmark` is a suite of things that move over a table; None leaves that part out."""
+    """What is run. `suite` is one of objects that move over a table; None leaves that part out."""
 
-    benchmark: Mapping[str, Any] | None = None
-    out: str = "recordings/benchmark"  # where the suite's recordings are, or go
+    suite: Mapping[str, Any] | None = None
+    recordings_dir: str = "recordings"  # missing recordings of the suite are simulated
     split: str = "test"
     smoke: bool = False
     workers: int = 1
@@ -55,11 +55,11 @@ def run_tagvision(
     Raises `ConfigError`, before anything is done, for a suite without pictures.
     """
     tell = on_progress or (lambda _: None)
-    suite = None if config.benchmark is None else from_mapping(Suite, config.benchmark, where="benchmark")
+    suite = None if config.suite is None else from_mapping(Suite, config.suite, where="suite")
     if suite is not None and suite.story == PLANAR:
         raise ConfigError(
-            f"{suite.name} has no pictures, only the phases of lines, which are scored without benchmark= as well (see "
-            "`lines`). Leave it out, or choose a suite of things that move over a table: benchmark=planar_tracks."
+            f"{suite.name} has no pictures, only the phases of lines, which are scored without suite= as well (see "
+            "`lines`). Leave it out, or choose a suite of things that move over a table: suite=planar_tracks."
         )
     folder.mkdir(parents=True, exist_ok=True)
     metrics: dict[str, Any] = {"paper": PAPER}
@@ -73,10 +73,15 @@ def run_tagvision(
     metrics["calibration"] = _calibrations(config)
     if suite is not None:
         suite = suite.smoke() if config.smoke else suite
-        make_suite(suite, Path(config.out), workers=config.workers, on_done=lambda made: tell(f"simulated {made.name}"))
+        make_suite(
+            suite,
+            Path(config.recordings_dir),
+            workers=config.workers,
+            on_done=lambda made: tell(f"simulated {made.name}"),
+        )
         items = [item for item in suite.items() if item.split == config.split]
         if not items:
-            raise ConfigError(f"{suite.name} has no {config.split} recording: raise benchmark.counts.{config.split}.")
+            raise ConfigError(f"{suite.name} has no {config.split} recording: raise suite.counts.{config.split}.")
         metrics["tracks"] = _tracks(config, items, folder, tell)
     write_json(folder / "metrics.json", metrics)
     (folder / "table.md").write_text(table(metrics) + "\n")
@@ -113,7 +118,7 @@ def _tracks(
         raise ConfigError("matching is empty; expected at least one setting to match with.")
     for number, item in enumerate(items):
         tell(f"{item.name} ({number + 1} of {len(items)})")
-        recording = open_recording(item.path(Path(config.out)))
+        recording = open_recording(item.path(Path(config.recordings_dir)))
         truth = table_truth(item, recording)
         settings = dataclasses.replace(config.calibration, seed=config.calibration.seed + 1000 + number)
         camera = calibrated(truth.camera, truth.area_m, settings)

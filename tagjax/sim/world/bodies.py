@@ -116,7 +116,6 @@ class World:
     lights: tuple[Light, ...] = (Light((2.5, 0.8, 2.6)),)
     ambient: float = 0.35
     names: dict[int, str] = dataclasses.field(default_factory=dict)  # label: name
-    wall_reflection: float = -0.5  # of the room's six sides, for the radio
     note: str = ""
 
     def check(self) -> None:

@@ -19,7 +19,6 @@ from .rotation import continuous, frame, multiply, quaternion_of, turn_about, un
 from .trajectory import smooth_step
 from .walks import Walk
 
-Side = Literal["left", "right"]
 Target = Float[np.ndarray, "steps 3"] | None
 
 BLEND_S = 0.3
@@ -96,18 +95,8 @@ def make_person(rng: np.random.Generator, *, height_m: float | None = None) -> P
     )
 
 
-def person_bodies(
-    model: PersonModel, walk: Walk, hands: Hands | None = None, *, label: int = 0, name: str = "person"
-) -> tuple[Body, ...]:
-    """The limbs of a person on a walk as bodies of role person, all with the same name and label.
-
-    `walk` is sampled every `STEP_S`; targets in `hands` have the same length, else `ValueError` is raised.
-    """
-    return limb_bodies(model, move_person(model, walk, hands), label=label, name=name)
-
-
 def limb_bodies(model: PersonModel, motion: PersonMotion, *, label: int = 0, name: str = "person") -> tuple[Body, ...]:
-    """The limbs of a person with a given motion as bodies: see `person_bodies`."""
+    """The limbs of a person with a given motion as bodies of role person, all with the same name and label."""
     shapes = limb_shapes(model)
     return tuple(Body(name, shapes[limb], poses, "person", label) for limb, poses in motion.limbs.items())
 
@@ -117,15 +106,6 @@ def badge_m(model: PersonModel) -> tuple[float, float, float]:
     chest = limb_shapes(model)["torso"][1]
     x, y, z = chest.position_m
     return x + chest.size_m[0] + 0.01, y, z
-
-
-def hand_path(model: PersonModel, walk: Walk, hands: Hands | None = None, side: Side = "right") -> Poses:
-    """Real pose of a hand's grip, after blending and clamping.
-
-    Frame: z from the grip towards the elbow (up while the arm hangs), x the thumb's side (ahead while it hangs).
-    """
-    motion = move_person(model, walk, hands)
-    return motion.left_hand if side == "left" else motion.right_hand
 
 
 def hand_target(

@@ -21,7 +21,6 @@ class Walk:
     position_m: np.ndarray  # (num_steps, 2) world x y
     velocity_m_s: np.ndarray  # (num_steps, 2)
     heading_rad: np.ndarray  # (num_steps,)
-    gait_rad: np.ndarray  # (num_steps,) phase of the stride
 
 
 def random_walks(
@@ -91,7 +90,7 @@ def _nearest(place: np.ndarray) -> float:
 
 
 def _as_walk(place: np.ndarray, velocity: np.ndarray, rng: np.random.Generator, start: float | None = None) -> Walk:
-    """Add the heading, which follows the velocity at 4 rad/s at most, and the gait phase."""
+    """Add the heading, which follows the velocity at 4 rad/s at most."""
     pace = np.linalg.norm(velocity, axis=-1)
     course = np.arctan2(velocity[:, 1], velocity[:, 0])
     moving = pace > 0.1
@@ -104,5 +103,5 @@ def _as_walk(place: np.ndarray, velocity: np.ndarray, rng: np.random.Generator, 
         rate += (np.clip(5.0 * turn, -4.0, 4.0) - rate) * min(1.0, STEP_S / 0.1)
         now += rate * STEP_S
         heading[step] = now
-    gait = rng.uniform(0, 2 * np.pi) + np.cumsum(2 * np.pi * STEP_S * pace / 1.4)
-    return Walk(place, velocity, heading, gait)
+    rng.uniform()  # unused; the frozen suites depend on the order of random numbers
+    return Walk(place, velocity, heading)

@@ -112,7 +112,7 @@ def _agreement_of_antenna(
         residual, channel = (jnp.broadcast_to(part, weight.shape) for part in (residual, one.channel))
         if evidence == "likelihood":
             return phase_likelihood(
-                residual, weight, channel, num_channels=settings.num_channels, flip_share=settings.flip_share
+                residual, weight, channel, num_channels=settings.num_channels, flip_share=settings.flip_probability
             )
         return coherence(residual, weight, channel, num_channels=settings.num_channels, multiple=multiple)
 
@@ -130,7 +130,7 @@ def _agreement_of_antenna(
     by_own = jax.vmap(modulo_pi)(reads, inside, steps)
 
     def told_by(explained: Float[Array, "tag piece"]) -> Float[Array, "tag piece"]:
-        lost = jax.nn.relu(1.0 - explained - settings.rest_margin)
+        lost = jax.nn.relu(1.0 - explained - settings.stationary_margin)
         return jax.lax.stop_gradient(jnp.where(jnp.any(inside, axis=-1), lost, 0.0))
 
     return Agreement(

@@ -29,12 +29,12 @@ class ObjectiveSettings:
     calibration: float = 0.0  # of the confidence: how often a mask's motion does explain the reads best
     evidence: Literal["coherence", "likelihood"] = "coherence"  # of the contrast
     temperature: float = 0.1  # of the contrast, in units of coherence; of the likelihood in nats
-    flip_share: float = 0.05  # of the likelihood: reads that are off by pi
+    flip_probability: float = 0.05  # of the likelihood: that a read is off by pi
     num_shifts: int = 4  # time-shifted copies of the own motion among the negatives
     span_frames: int = 6  # coherence is taken over pieces this long: drift of the sum does not reach further
     skip_frames: int = 12  # at the start of a clip, while the tracer has not seen enough
     min_reads: int = 6  # a piece with fewer reads says nothing
-    rest_margin: float = (
+    stationary_margin: float = (
         0.05  # a piece whose reads, modulo pi, lose less coherence than this by taking the tag to rest is left out
     )
     max_reads: int = 384  # reads of one tag in a clip
@@ -47,8 +47,10 @@ class ObjectiveSettings:
     term_norms: bool = False  # log each term's gradient norm: each goes back by itself, three take 1.7 times the time
 
     def __post_init__(self) -> None:
-        if not 0 < self.flip_share < 1:
-            raise ValueError(f"flip_share is {self.flip_share}; expected a share between 0 and 1, both left out.")
+        if not 0 < self.flip_probability < 1:
+            raise ValueError(
+                f"flip_probability is {self.flip_probability}; expected a value between 0 and 1, both excluded."
+            )
 
     def weights(self) -> dict[str, float]:
         """The weight of each term that takes part, by name."""

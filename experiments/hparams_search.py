@@ -1,4 +1,4 @@
-"""What sweeps need of a command: how many of a study's trials are left, and what a job tells its sweep."""
+"""What a hyper-parameter search needs of a command: the trials that are left, and the score of a run."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from .run_folder import checkpoint_steps
 def trials_left(
     wanted: int, storage: str, study: str, folder: str, launched: str = "", *, _root_: DictConfig | None = None
 ) -> int:
-    """How many trials an Optuna study still lacks: a sweep that was killed does these when it is started again.
+    """The number of trials that an Optuna study still lacks: a killed search does these when it is started again.
 
-    Only trials that were finished count; one that was killed stays among them as running, and is tried no more.
-    `folder` is the sweep's, in which Hydra writes the best trial also where none is left to do. `launched`
-    is the time: Hydra keeps what it was told here for the folders of all jobs. Ends the command if the trials would have
-    no score: recordings are named, but none that is held out.
+    Only finished trials count; a killed one stays in the study as running and is not repeated. `folder` is the sweep's: it
+    is made where no trial is left, because Hydra writes the best trial there. `launched` is the time of the launch: because
+    it is resolved here first, the folders of all jobs get the same time. Ends the command if the trials would have no score, which is so
+    where training recordings are given and held-out ones are not.
     """
     import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
 
     del launched
     if _root_ is not None and _without_score(_root_):
         raise SystemExit(
-            "search: data.recordings is given and data.validation is empty: no trial would have a score. Name held-out "
-            "recordings: data.validation=[...]."
+            "hparams_search: data.recordings is given and data.validation is empty, so no trial would have a score. Name "
+            "held-out recordings: data.validation=[...]."
         )
     optuna.logging.set_verbosity(logging.WARNING)
     if storage.startswith("sqlite:///"):
@@ -44,17 +44,17 @@ def trials_left(
 
 
 def _without_score(config: DictConfig) -> bool:
-    named, held_out = (OmegaConf.select(config, f"data.{name}") for name in ("recordings", "validation"))
+    given, held_out = (OmegaConf.select(config, f"data.{name}") for name in ("recordings", "validation"))
     overrides = OmegaConf.select(config, "hydra.overrides.task") or ()
     swept = [*overrides, *(OmegaConf.select(config, "hydra.sweeper.params") or ())]
-    return bool(named) and not held_out and not any("data.validation" in one for one in swept)
+    return bool(given) and not held_out and not any("data.validation" in one for one in swept)
 
 
-def told(score: float, folder: Path, num_steps: int) -> float | None:
-    """What a training run tells its sweep: None for NaN, by which a trial fails; NaN itself ends an Optuna sweep.
+def sweep_score(score: float, folder: Path, num_steps: int) -> float | None:
+    """The number that a training run returns to its sweep: None for NaN, which marks the trial as failed.
 
-    Raises `KeyboardInterrupt` in a sweep if the run was stopped before its last step, which is no failure: the jobs after
-    it must not start. The run's checkpoint is then written.
+    NaN itself would end an Optuna sweep. Raises `KeyboardInterrupt` in a sweep if the run was stopped before its last step:
+    that is no failure, and the jobs after it must not start. The run's checkpoint is then written.
     """
     steps = checkpoint_steps(folder)
     if math.isnan(score) and sweeping() and steps and max(steps) < num_steps:

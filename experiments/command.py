@@ -1,0 +1,69 @@
+"""What every command shares: Hydra's configuration becomes checked settings, and errors end the command in one line."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from .errors import errors_in_one_line
+from .help import command_help
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+"""The folder of the configuration: beside `experiments` in a clone, and beside it in the installed package."""
+
+T = TypeVar("T")
+
+OmegaConf.register_new_resolver("command_help", functools.partial(command_help, CONF), replace=True)
+
+
+def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], Any]:
+    """The entry point of a module `experiments/<name>.py`, which Hydra configures by conf/<name>.yaml.
+
+    `function` gets the configuration as plain values and the run folder. A number that it returns is a sweep's objective.
+    """
+    name = Path(function.__code__.co_filename).stem
+
+    @functools.wraps(function)
+    def run(config: DictConfig) -> Any:
+        with errors_in_one_line(name):
+            return function(plain_values(config), Path(HydraConfig.get().runtime.output_dir))
+
+    return hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(run)
+
+
+def plain_values(config: DictConfig) -> dict[str, Any]:
+    """The resolved configuration as plain values, for the library knows neither Hydra nor OmegaConf.
+
+    Without `paths` and `num_trials`, which serve other keys of the configuration only.
+    """
+    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items() if key not in ("paths", "num_trials")}
+
+
+def checked(schema: type[T], values: Mapping[str, Any], folder: Path) -> T:
+    """The settings, validated; the values are then written to the run folder's config.yaml."""
+    from tagjax.core.settings import from_mapping
+
+    settings = from_mapping(schema, values)
+    write_config(values, folder)
+    return settings
+
+
+def write_config(values: Mapping[str, Any], folder: Path) -> None:
+    """Write config.yaml into the run folder."""
+    OmegaConf.save(OmegaConf.create(dict(values)), folder / "config.yaml")
+
+
+def print_result(result: Any) -> None:
+    """Print a result as JSON, the last line of a command's output."""
+    from tagjax.report.report import plain
+
+    print(json.dumps(plain(result), allow_nan=False))

@@ -1,0 +1,36 @@
+"""The console commands `tagjax-train`, `tagjax-evaluate`, ...: the entry points of `experiments`.
+
+An installed wheel has them as `tagjax.experiments`. In a clone, and so in an editable install, they are the top-level package
+`experiments`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+
+
+def _command(name: str) -> Callable[[], None]:
+    def run() -> None:
+        package = next(one for one in ("tagjax.experiments", "experiments") if importlib.util.find_spec(one))
+        importlib.import_module(f"{package}.{name}").main()
+
+    return run
+
+
+benchmark = _command("benchmark")
+calibrate_camera = _command("calibrate_camera")
+compare = _command("compare")
+evaluate = _command("evaluate")
+evaluate_flow = _command("evaluate_flow")
+goller = _command("goller")
+import_recording = _command("import_recording")
+reproduce = _command("reproduce")
+simulate = _command("simulate")
+sweep_paper = _command("sweep_paper")
+tagview = _command("tagview")
+tagvision = _command("tagvision")
+tracks = _command("tracks")
+train = _command("train")
+train_flow = _command("train_flow")

@@ -1,0 +1,53 @@
+"""A tracer and its clips from settings as under conf/tracer, or from a file of learned parameters.
+
+Beside `_target_` and the tracer's parameters such settings may hold `clips`: the clip settings that the tracer is meant
+for (`stride`, `window`, ...). A file of learned parameters holds those it was trained with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..core.build import build
+from ..core.settings import changed
+from ..tracing.clips import ClipSettings
+from ..tracing.tracer import AbstractTracer
+from . import TagAttention
+from .learned import load_parameters, read_learned
+
+
+def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> AbstractTracer:
+    """The tracer that the settings describe, with the learned parameters `weights` if given (`load_parameters`).
+
+    Raises `ValueError` if the settings describe something else, or a tracer that has no learned parameters.
+    """
+    parameters = {name: value for name, value in settings.items() if name != "clips"}
+    tracer = build(parameters, where="tracer")
+    if not isinstance(tracer, AbstractTracer):
+        raise ValueError(f"tracer: found {settings['_target_']}; expected a subclass of AbstractTracer.")
+    if weights is None:
+        return tracer
+    if not isinstance(tracer, TagAttention):
+        raise ValueError(
+            f"weights={weights}: found the tracer {settings['_target_']}; learned parameters are of TagAttention. Leave out "
+            "weights=, or choose another tracer."
+        )
+    return load_parameters(tracer, weights, parameters)
+
+
+def tracer_clips(settings: Mapping[str, Any]) -> ClipSettings:
+    """The clip settings of a tracer's configuration; the defaults for what it does not name."""
+    return changed(ClipSettings(), settings.get("clips") or {}, where="tracer.clips")
+
+
+def learned_tracer(weights: str, settings: Mapping[str, Any] | None = None) -> tuple[AbstractTracer, ClipSettings]:
+    """The tracer with learned parameters, and the clip settings that it was trained with.
+
+    Without `settings` the tracer is the one that the file was learned from. Errors as of `make_tracer`.
+    """
+    if settings is None:
+        settings = read_learned(weights).settings
+    tracer = make_tracer(settings, weights)
+    learned = read_learned(weights, settings)
+    return tracer, changed(ClipSettings(), learned.clips, where=f"{learned.path}: clips")
