@@ -31,6 +31,7 @@ from tagjax.evaluation.reproduce.status import stale, status
 from tagjax.evaluation.reproduce.table import begin, filled, read_table, table_path, write_table
 from tagjax.metrics.recordings import RecordingResult, ScoreSettings
 from tagjax.metrics.tracking import FrameScores, Scores
+from tagjax.sim.suites import Suite
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted((ROOT / "conf" / "table").glob("*.yaml"))
@@ -539,12 +540,32 @@ def test_every_recipe_names_what_is_there_and_depends_on_it(path: Path):
     assert {Path(name).stem for name in files} >= {*recipe.suites(), *recipe.tracers()}
     code = [name for name in files if name.startswith("tagjax/")]
     assert {Path(name).parts[1] for name in code} >= {"radio", "flow", "sim", "tracing", "tagattention", "metrics"}
-    inputs = Inputs(
-        suites_named(recipe.suites()), {name: _tracer(name) for name in recipe.tracers()}, ROOT, ROOT, files
+    assert _follows_from(recipe)
+
+
+def _follows_from(recipe: Recipe) -> dict[str, dict[str, Any]]:
+    """What the scores of the first recording follow from, by job."""
+    files = dependencies(ROOT, recipe.depends)
+    tracers = {name: _tracer(name) for name in recipe.tracers()}
+    inputs = Inputs(suites_named(recipe.suites()), tracers, ROOT, ROOT, files)
+    return {
+        job.name: measuring._tracing(recipe, inputs, job).determinants(
+            from_mapping(Suite, inputs.suites[job.suite]).items()[0], files
+        )
+        for job in recipe.jobs()
+    }
+
+
+def test_tables_that_need_the_same_scores_share_them():
+    """What one table has measured, the other takes from the folder of finished scores."""
+    main, handheld = (
+        _follows_from(from_mapping(Recipe, _settings(ROOT / "conf" / "table" / f"{name}.yaml")))
+        for name in ("main", "handheld")
     )
-    for job in recipe.jobs():
-        tracing = measuring._tracing(recipe, inputs, job)
-        assert tracing.determinants(from_mapping(measuring.Suite, inputs.suites[job.suite]).items()[0], files)
+    for suite in ("single_static", "multi_4"):
+        for system in ("online", "offline", "paper"):
+            one = f"{suite}/test/handheld/"
+            assert main[f"{one}handheld_{system}"] == handheld[f"{one}{system}"]
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)

@@ -98,7 +98,10 @@ class Tracing:
         )
 
     def determinants(self, item: Item, code: Mapping[str, str]) -> dict[str, Any]:
-        """All that the scores follow from, as plain JSON. Settings count by their values, other files by their content."""
+        """All that the scores follow from, as plain JSON.
+
+        Settings (.yaml) and learned parameters (.json) count by their values, all other files by their content.
+        """
         suite = dataclasses.asdict(item.suite)
         for name in ("about", "paper", "counts", "variants"):  # of other recordings, or words
             del suite[name]
@@ -109,7 +112,7 @@ class Tracing:
             "clips": dataclasses.asdict(self.clips),
             "scores": dataclasses.asdict(self.scores_settings),
             "frames": self.frames,
-            "code": {path: content for path, content in code.items() if not path.endswith((".yaml", ".md"))},
+            "code": {path: content for path, content in code.items() if not path.endswith((".yaml", ".json"))},
         }
         return json.loads(json.dumps(plain(everything)))
 
