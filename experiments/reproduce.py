@@ -1,10 +1,8 @@
 """Make a table of results from its recipe: measure it, write it as JSON and into the pages that show it.
 
-python -m experiments.reproduce table=handheld
+python -m experiments.reproduce table=handheld               # interrupted, it resumes when it is started again
 python -m experiments.reproduce table=handheld render=true   # the Markdown again, from the JSON
 python -m experiments.reproduce check=true                   # which tables are stale, and why
-
-Interrupted, it resumes when it is started again. It needs a clone of the repository, whose pages it writes.
 """
 
 from __future__ import annotations
@@ -59,8 +57,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
         return
     if not chosen:
         raise ValueError(f"found no table; expected table=<name>, one of {', '.join(one.name for one in recipes)}.")
-
-    from tagjax.evaluation.reproduce.make import make_table
+    from tagjax.evaluation.reproduce.make import make_table  # needs the sim extra
 
     with counting_bar(console, shown=values["progress"]) as bar:
         task = bar.add_task(recipes[0].name, total=None)
