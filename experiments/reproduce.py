@@ -1,0 +1,78 @@
+"""Make a table of results from its recipe: measure it, write it as JSON and into the pages that show it.
+
+python -m experiments.reproduce table=handheld               # interrupted, it resumes when it is started again
+python -m experiments.reproduce table=handheld render=true   # the Markdown again, from the JSON
+python -m experiments.reproduce check=true                   # which tables are stale, and why
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hydra import compose
+from omegaconf import OmegaConf
+
+from .command import CONF, command, plain_values
+from .progress import counting_bar
+from .suites import suites_named
+
+ROOT = CONF.parent
+
+
+def recipe_settings() -> list[Any]:
+    """The settings of every recipe in conf/table."""
+    return [OmegaConf.to_container(OmegaConf.load(path)) for path in sorted((CONF / "table").glob("*.yaml"))]
+
+
+def tracer_settings(name: str) -> dict[str, Any]:
+    """The settings of a tracer by name. Raises `ValueError` for a name that is no file of conf/tracer."""
+    if name not in (known := sorted(path.stem for path in (CONF / "tracer").glob("*.yaml"))):
+        raise ValueError(f"tracer: found {name}; expected one of {', '.join(known)}.")
+    return plain_values(compose(f"tracer/{name}").tracer)
+
+
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
+    from rich.console import Console
+
+    from tagjax.core.settings import from_mapping
+    from tagjax.evaluation.reproduce.markdown import rendered, write_pages
+    from tagjax.evaluation.reproduce.recipe import Recipe
+    from tagjax.evaluation.reproduce.status import status
+
+    if not (ROOT / "docs").is_dir():
+        raise ValueError(
+            f"found no folder docs in {ROOT}; expected a clone of the repository, whose pages are written."
+        )
+    chosen, console = values.get("table"), Console(soft_wrap=True, highlight=False, markup=False)
+    recipes = [from_mapping(Recipe, one, where="table") for one in ([chosen] if chosen else recipe_settings())]
+    if values["check"]:
+        found = [line for recipe in recipes for line in status(recipe, ROOT)]
+        console.print(*found or ["Every table is up to date."], sep="\n")
+        raise SystemExit(1 if found else 0)
+    if values["render"]:
+        written = [f"written: {path}" for recipe in recipes for path in write_pages(recipe, ROOT)]
+        console.print(*written or ["Every page shows its tables."], sep="\n")
+        return
+    if not chosen:
+        raise ValueError(f"found no table; expected table=<name>, one of {', '.join(one.name for one in recipes)}.")
+    from tagjax.evaluation.reproduce.make import make_table  # needs the sim extra
+
+    with counting_bar(console, shown=values["progress"]) as bar:
+        task = bar.add_task(recipes[0].name, total=None)
+        table = make_table(
+            recipes[0],
+            ROOT,
+            suites=suites_named(recipes[0].suites()),
+            tracers={name: tracer_settings(name) for name in recipes[0].tracers()},
+            recordings=Path(values["recordings_dir"]),
+            finished=Path(values["finished_dir"]),
+            workers=values["workers"],
+            on_progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+        )
+    console.print(rendered(table))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""Make a table from its recipe: measure it, write its JSON, and put it into its pages. Simulating needs the sim extra."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .markdown import write_pages
+from .measure import Inputs, OnProgress, measure
+from .recipe import Recipe
+from .table import begin, filled, table_path, write_table
+
+
+def make_table(
+    recipe: Recipe,
+    root: Path,
+    *,
+    suites: Mapping[str, Mapping[str, Any]],
+    tracers: Mapping[str, Mapping[str, Any]],
+    recordings: Path,
+    finished: Path,
+    workers: int = 1,
+    on_progress: OnProgress | None = None,
+) -> dict[str, Any]:
+    """Measure a table, write it to docs/tables below `root` and into its pages, and return it.
+
+    `suites` and `tracers` are the settings that the recipe names (`Recipe.suites`, `Recipe.tracers`). Suites lie in
+    `recordings`, where what is missing is simulated by `workers` processes; scores of each recording that has been traced
+    are kept in `finished`, so that the next call goes on after an interruption.
+    """
+    begun = begin(recipe, root)
+    inputs = Inputs(suites, tracers, recordings, finished, begun["depends"], workers)
+    table = filled(begun, recipe, measure(recipe, inputs, on_progress=on_progress))
+    write_table(table_path(root, recipe.name), table)
+    write_pages(recipe, root)
+    return table

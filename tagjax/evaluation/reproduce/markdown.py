@@ -1,0 +1,143 @@
+"""A table as Markdown between the markers of its pages. What is written follows from the table's JSON alone."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .recipe import COUNTS, Recipe
+from .table import command, read_table, table_path
+
+
+def rendered(table: Mapping[str, Any]) -> str:
+    """The table, and below it the command, revision, date and machine that it was made by, and what was recorded by hand."""
+    columns = table["columns"]
+    lines = ["| | " + " | ".join(column["heading"] for column in columns) + " |", "|" + "---|" * (len(columns) + 1)]
+    for row in table["rows"]:
+        mark = "" if row["kind"] == "score" else " \\*"
+        cells = [_cell(row["cells"][column["name"]], column) for column in columns]
+        lines.append("| " + " | ".join([_escaped(row["label"]) + mark, *cells]) + " |")
+    notes = [_made_by(table)]
+    if any(column["interval"] for column in columns):
+        interval = table["interval"]
+        notes.append(
+            f"Square brackets: {interval['level']:.0%} interval by recording ({interval['num_resamples']:,} bootstrap resamples)."
+        )
+    notes += _recorded_notes(table)
+    return "\n".join(lines) + "\n\n" + " ".join(notes)
+
+
+def not_made(name: str) -> str:
+    """What stands between the markers of a table that has not been made."""
+    return f"*This table has not been made yet: `{command(name)}`.*"
+
+
+def replaced(text: str, name: str, body: str) -> str:
+    """The text of a page with `body` between a table's markers. Raises `ValueError` where they are missing or doubled."""
+    head, _, tail = _parts(text, name)
+    return f"{head}\n{body}\n{tail}"
+
+
+def pages(recipe: Recipe, root: Path) -> dict[Path, tuple[str, str]]:
+    """What stands in each page of a table, and what should by its JSON. Raises `ValueError` for missing markers."""
+    table = read_table(table_path(root, recipe.name))
+    body = not_made(recipe.name) if table is None else rendered(table)
+    found = {}
+    for name in recipe.pages:
+        path = root / name
+        try:
+            before = path.read_text(encoding="utf-8")
+            found[path] = before, replaced(before, recipe.name, body)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{path}: {error}") from error
+    return found
+
+
+def differing(recipe: Recipe, root: Path) -> list[Path]:
+    """The pages whose table is not that of the JSON."""
+    return [path for path, (before, after) in pages(recipe, root).items() if before != after]
+
+
+def write_pages(recipe: Recipe, root: Path) -> list[Path]:
+    """Put the table of the JSON into its pages; those that this changed."""
+    changed = []
+    for path, (before, after) in pages(recipe, root).items():
+        if before != after:
+            beside = path.with_name(f"{path.name}.part")
+            beside.write_text(after, encoding="utf-8")
+            os.replace(beside, path)
+            changed.append(path)
+    return changed
+
+
+def _parts(text: str, name: str) -> tuple[str, str, str]:
+    begin, end = f"<!-- table: {name} -->", "<!-- /table -->"
+    if text.count(begin) != 1:
+        raise ValueError(f"found the marker {begin} {text.count(begin)} times; expected it once, on a line of its own.")
+    head, _, rest = text.partition(begin)
+    body, found, tail = rest.partition(end)
+    if not found or "<!-- table: " in body:
+        raise ValueError(f"found no {end} after {begin}; put it below the table, on a line of its own.")
+    return head + begin, body, end + tail
+
+
+def _cell(cell: Mapping[str, Any] | None, column: Mapping[str, Any]) -> str:
+    if cell is None:
+        return ""
+    if cell["kind"] == "recorded":
+        return _escaped(cell["text"] if cell["paper"] is None else f"{cell['text']} ({cell['paper']})")
+    found = []
+    for number, measure in enumerate(column["measures"]):
+        if measure in COUNTS:
+            found.append(f"{cell[measure]:,}")
+            continue
+        value = cell["values"][measure]
+        text = _number(measure, value["value"], value)
+        if number == 0 and column["interval"] and value["low"] is not None:
+            text += f" [{_plain_number(measure, value['low'])}, {_plain_number(measure, value['high'])}]"
+        found.append(text)
+    return " / ".join(found)
+
+
+def _number(measure: str, value: float | None, whole: Mapping[str, Any]) -> str:
+    if value is None:
+        return "-"
+    if measure == "locked":
+        return f"{whole['total']:.0f} of {whole['count']}"
+    return _plain_number(measure, value) + (" px" if measure == "cle_px" else "")
+
+
+def _plain_number(measure: str, value: float) -> str:
+    if measure == "cle_px":
+        return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
+    return f"{value:.2f}"
+
+
+def _made_by(table: Mapping[str, Any]) -> str:
+    revision, machine = table["revision"], table["machine"]
+    commit = "unknown" if revision["commit"] is None else f"`{revision['commit'][:10]}`"
+    changed = " with uncommitted changes" if revision["dirty"] else ""
+    on = f"{machine['cores']} cores ({machine['processor']}), jax {machine['jax']}"
+    return f"Made by `{table['command']}`, revision {commit}{changed}, {table['date_utc'][:10]}, on {on}."
+
+
+def _recorded_notes(table: Mapping[str, Any]) -> list[str]:
+    """One sentence on rows recorded by hand: at which revisions and dates they were measured."""
+    sources = dict.fromkeys(
+        f"revision `{cell['revision'][:10]}`, {cell['date']}"
+        for row in table["rows"]
+        for cell in row["cells"].values()
+        if cell is not None and cell["kind"] == "recorded" and cell["paper"] is None
+    )
+    if not sources:
+        return []
+    where = f"conf/table/{table['name']}.yaml"
+    return [f"\\* Recorded by hand, not made by this command: {'; '.join(sources)}; the commands stand in `{where}`."]
+
+
+def _escaped(text: str) -> str:
+    """A cell's text: a bar within it would begin another cell."""
+    return re.sub(r"(?<!\\)\|", r"\\|", text)

@@ -1,0 +1,183 @@
+"""The recipe of a table: its rows and columns, what is measured for each cell, and the files that the values follow from.
+
+A recipe is plain settings (conf/table/<name>.yaml). Nothing in it is executed: what can be measured is a score of a suite
+(`kind: score`), and what cannot be measured from a simulated suite is written by hand with its source (`kind: recorded`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+from typing import Any, Literal
+
+from ...core.settings import ConfigError, changed
+from ...metrics.recordings import ScoreSettings
+from ...tracing.clips import ClipSettings
+
+Kind = Literal["score", "recorded"]
+
+Split = Literal["train", "validation", "test"]
+
+COUNTS = ("num_recordings", "num_tags", "num_frames")
+"""Measures that only count what a cell's scores are the mean of."""
+
+MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "false_detections", *COUNTS)
+"""What a column can show: scores of `tagjax.metrics.tracking.Scores`, `locked` (of all tags), and counts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class System:
+    """A tracer as it is measured.
+
+    `clips` holds what differs from the clips of the weights or of the tracer's settings, `scores` what differs from the
+    protocol.
+    """
+
+    tracer: str  # the name of its settings in conf/tracer
+    weights: str | None = None  # learned parameters: `default`, a name, or a file
+    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        changed(ClipSettings(), self.clips, where="clips")
+        changed(ScoreSettings(), self.scores, where="scores")
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """Which frames of a recording are traced (all if None), and which count: what differs from `ScoreSettings`."""
+
+    frames: tuple[int, int] | None = None
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        changed(ScoreSettings(), self.scores, where="scores")
+        if self.frames is not None and not 0 <= self.frames[0] < self.frames[1]:
+            raise ConfigError(f"frames is {list(self.frames)}; expected [from, to] with 0 <= from < to.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """A value written by hand, with the command, revision and date that it was measured by, or the paper that gives it."""
+
+    text: str
+    command: str | None = None
+    revision: str | None = None
+    date: str | None = None
+    paper: str | None = None  # "Fig. 10"
+
+    def __post_init__(self) -> None:
+        measured = [self.command, self.revision, self.date]
+        if None in measured if self.paper is None else any(measured):
+            raise ConfigError(
+                f"{self.text!r}: found command {self.command}, revision {self.revision}, date {self.date}, paper {self.paper}; "
+                "expected the first three (a value measured here), or paper alone (a value that a paper gives)."
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """A column: its heading, and the measures that it shows."""
+
+    heading: str
+    measures: tuple[str, ...] = ()  # none: a column of recorded values
+    interval: bool = False  # whether the first measure is followed by its 95 % interval
+
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.measures if name not in MEASURES]:
+            raise ConfigError(f"found measure {', '.join(unknown)}; expected some of {', '.join(MEASURES)}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A row: a suite's recordings, scored, or values recorded by hand; `recorded` is by the name of the column."""
+
+    label: str
+    kind: Kind = "score"
+    suite: str | None = None
+    split: Split = "test"
+    seeds: tuple[int, ...] | None = None  # the suite's recordings drawn with these seeds together; its own seed if None
+    protocol: str | None = None
+    system: str | Mapping[str, str] | None = None  # of all columns, or by the name of the column
+    recorded: Mapping[str, Recorded] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.kind == "score" and (self.suite is None or self.protocol is None):
+            raise ConfigError(f"row {self.label!r}: found no suite or no protocol; a score needs both.")
+        if self.kind == "recorded" and (self.suite or self.protocol or self.system or not self.recorded):
+            raise ConfigError(f"row {self.label!r}: kind is recorded; expected only recorded values, without a suite.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What a cell's scores are measured on and by: every recording of a suite's split, under a protocol, by a system."""
+
+    suite: str
+    split: str
+    seeds: tuple[int, ...] | None
+    protocol: str
+    system: str
+
+    @property
+    def name(self) -> str:
+        """A name for people and for the JSON."""
+        seeds = "" if self.seeds is None else f"/seeds {', '.join(map(str, self.seeds))}"
+        return f"{self.suite}/{self.split}{seeds}/{self.protocol}/{self.system}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """Everything that a table follows from, except for the files that `depends` names."""
+
+    name: str
+    title: str
+    pages: tuple[str, ...]  # files that hold the markers `<!-- table: name -->` and `<!-- /table -->`
+    columns: Mapping[str, Column]
+    rows: tuple[Row, ...]
+    depends: tuple[str, ...]  # patterns of files (`tagjax/radio/**/*.py`); the table is stale once one of them changes
+    systems: Mapping[str, System] = dataclasses.field(default_factory=dict)
+    protocols: Mapping[str, Protocol] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("pages", "columns", "rows", "depends"):
+            if not getattr(self, name):
+                raise ConfigError(f"{name} is empty; expected at least one.")
+        for path in (*self.pages, *self.depends):
+            if PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts:
+                raise ConfigError(f"found {path!r}; expected a path within the repository, from its root.")
+        for row in self.rows:
+            self._check(f"row {row.label!r}: recorded", row.recorded, self.columns)
+            if row.kind == "score":
+                self._check(f"row {row.label!r}: protocol", [row.protocol], self.protocols)
+                by_column = row.system if isinstance(row.system, Mapping) else {}
+                self._check(f"row {row.label!r}: system", by_column, self.columns)
+                named = by_column.values() if by_column else [row.system] if row.system else []
+                self._check(f"row {row.label!r}: system", named, self.systems)
+
+    @staticmethod
+    def _check(where: str, found: Any, known: Mapping[str, Any]) -> None:
+        if unknown := [str(name) for name in found if name not in known]:
+            raise ConfigError(f"{where}: found {', '.join(unknown)}; expected some of {', '.join(known) or 'none'}.")
+
+    def job(self, row: Row, column: str) -> Job | None:
+        """What the cell of a row and a column needs measured; None for a recorded or an empty cell."""
+        system = row.system.get(column) if isinstance(row.system, Mapping) else row.system
+        if row.suite is None or row.protocol is None or system is None or column in row.recorded:
+            return None
+        if not self.columns[column].measures:
+            return None
+        return Job(row.suite, row.split, row.seeds, row.protocol, system)
+
+    def jobs(self) -> list[Job]:
+        """What is to be measured, each once, in the order of the table."""
+        found = [self.job(row, column) for row in self.rows for column in self.columns]
+        return list(dict.fromkeys(job for job in found if job is not None))
+
+    def suites(self) -> list[str]:
+        """Names of the suites that are measured on."""
+        return list(dict.fromkeys(job.suite for job in self.jobs()))
+
+    def tracers(self) -> list[str]:
+        """Names of the tracers' settings that are measured."""
+        return list(dict.fromkeys(self.systems[job.system].tracer for job in self.jobs()))
