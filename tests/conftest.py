@@ -6,6 +6,7 @@ import dataclasses
 import os
 from pathlib import Path
 
+import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,9 +25,20 @@ if jax.__version_info__ < (0, 11):  # XLA ends a process that gives it a flag it
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 
 
+# Examples are drawn anew in the same order each time: a run that passes, passes again. Compilation has no deadline.
+_EXAMPLES = {"derandomize": True, "database": None, "deadline": None, "print_blob": False}
+hypothesis.settings.register_profile("quick", max_examples=12, **_EXAMPLES)
+hypothesis.settings.register_profile("ci", max_examples=150, **_EXAMPLES)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--ci", action="store_true", help="also run the tests marked ci")
     parser.addoption("--slow", action="store_true", help="also run the tests marked slow, and those marked ci")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not config.getoption("--hypothesis-profile"):
+        hypothesis.settings.load_profile("ci" if config.getoption("--ci") else "quick")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -58,7 +58,10 @@ def clean_epc(text: str | None) -> str:
     """An EPC in upper-case hex, without spaces, hyphens and the b'...' of printed Python bytes."""
     cleaned = (text or "").strip()
     if re.fullmatch(r"b(['\"]).*\1", cleaned):
-        cleaned = ast.literal_eval(cleaned).decode("ascii", "replace")
+        try:
+            cleaned = ast.literal_eval(cleaned).decode("ascii", "replace")
+        except (SyntaxError, ValueError) as error:
+            raise RowError("EPC is not hexadecimal") from error
     cleaned = re.sub(r"[\s-]", "", cleaned).upper()
     if not re.fullmatch(r"[0-9A-F]{4,}", cleaned):
         raise RowError("EPC is not hexadecimal")

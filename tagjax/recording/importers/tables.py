@@ -20,6 +20,9 @@ from .formats import FORMATS, Format, Read, RowError, recognise
 MAX_REJECTED = 0.5
 """A table of which a larger fraction of rows is rejected is taken for another format."""
 
+_MAX_NUMBER = np.iinfo(np.int16).max
+_MAX_TIME_NS = np.iinfo(np.int64).max
+
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
@@ -139,8 +142,12 @@ def _choose(path: Path, lines: list[str], name: str) -> Format:
 def _checked(read: Read) -> Read:
     if read.phase_rad is None:
         raise RowError("phase is absent")
-    if read.antenna < 1:
-        raise RowError("antenna is below 1")
+    if not 1 <= read.antenna <= _MAX_NUMBER:
+        raise RowError(f"antenna is outside 1 to {_MAX_NUMBER}")
+    if read.channel_index is not None and not 0 <= read.channel_index <= _MAX_NUMBER:
+        raise RowError(f"channel index is outside 0 to {_MAX_NUMBER}")
+    if any(stamp is not None and not 0 <= stamp <= _MAX_TIME_NS for stamp in (read.reader_ns, read.host_ns)):
+        raise RowError("time is outside 1970 to 2262: wrong unit?")
     if read.rssi_dbm is not None and not -120 <= read.rssi_dbm <= 20:
         raise RowError("RSSI is outside -120 to 20 dBm: wrong unit?")
     if read.carrier_hz is not None and not 300e6 <= read.carrier_hz <= 6e9:
