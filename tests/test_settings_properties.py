@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -127,10 +128,8 @@ def test_every_field_has_values_that_are_refused():
 
 @given(st.dictionaries(st.sampled_from([field.name for field in dataclasses.fields(Outer)]) | WORDS, ANYTHING))
 def test_anything_gives_settings_or_a_config_error(values):
-    try:
+    with contextlib.suppress(ConfigError):  # any other error fails the test
         assert isinstance(from_mapping(Outer, values), Outer)
-    except ConfigError as error:
-        assert str(error)
 
 
 @pytest.mark.parametrize("schema", [TrainConfig, ObjectiveSettings, LoopSettings, ScoreSettings])
@@ -138,10 +137,8 @@ def test_anything_gives_settings_or_a_config_error(values):
 def test_anything_in_a_field_of_real_settings_gives_settings_or_a_config_error(schema, data):
     least = {"tracer": {"_target_": "a"}, "optimizer": {"_target_": "b"}} if schema is TrainConfig else {}
     field = data.draw(st.sampled_from([field.name for field in dataclasses.fields(schema)]))
-    try:
+    with contextlib.suppress(ConfigError):
         assert isinstance(from_mapping(schema, {**least, field: data.draw(ANYTHING)}), schema)
-    except ConfigError as error:
-        assert str(error)
 
 
 @given(OUTER, INNER)
