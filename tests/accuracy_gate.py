@@ -21,9 +21,6 @@ SCORES = ("iou", "identification")
 MARGIN = 0.03
 """By how much a score may fall below its recorded value: more than compilers and machines differ by."""
 
-SUITE = "benchmark"  # the configuration group of suites
-RECORDINGS_DIR = "out"  # the key of the folder that recordings are simulated into
-
 
 @dataclasses.dataclass(frozen=True)
 class Case:
@@ -35,9 +32,7 @@ class Case:
 
 
 CASES = {
-    "walking people": Case(
-        "crowd", ("duration_s=8.0", "+capture.width=320"), ("tracer=tagattention", "weights=default")
-    ),
+    "walking people": Case("walkers", (), ("weights=default",)),
     "hand-held object": Case(
         "single_static",
         ("duration_s=3.5", "variants=[{name: box, settings: {kinds: [box]}}]"),
@@ -64,9 +59,9 @@ def _run(module: str, *arguments: str) -> str:
 
 def scores(case: Case, folder: Path) -> dict[str, float]:
     """Simulate the recording into a folder, trace it, and give its scores over all tags."""
-    counts = [f"{SUITE}.counts.{split}={number}" for split, number in (("train", 0), ("validation", 0), ("test", 1))]
-    changes = [f"{'+' * change.startswith('+')}{SUITE}.{change.lstrip('+')}" for change in case.changes]
-    simulated = (f"{SUITE}={case.suite}", *counts, *changes, f"{RECORDINGS_DIR}={folder}", "workers=1")
+    counts = [f"suite.counts.{split}={number}" for split, number in (("train", 0), ("validation", 0), ("test", 1))]
+    changes = [f"suite.{change}" for change in case.changes]
+    simulated = (f"suite={case.suite}", *counts, *changes, f"recordings_dir={folder}", "workers=1")
     _run("simulate", *simulated, f"hydra.run.dir={folder / 'simulate'}")
     (recording,) = sorted((folder / case.suite / "test").glob("*.zarr"))
     printed = _run("evaluate", *case.tracing, f"recordings=[{recording}]", f"hydra.run.dir={folder / 'evaluate'}")

@@ -368,6 +368,8 @@ def test_the_configuration_fits_its_schema_and_names_every_key():
 def test_dis_on_middlebury_is_as_published_for_it(real_data):
     """0.23, 0.32, 0.65 and 0.16 px were measured with other code (shared/data/README.md)."""
     expected = {"RubberWhale": 0.23, "Grove2": 0.32, "Urban2": 0.65, "Dimetrodon": 0.16}
-    for case in folder_material(str(real_data / "flow" / "middlebury")).cases():
+    cases = list(folder_material(str(real_data / "flow" / "middlebury")).cases())
+    assert {case.source for case in cases} == set(expected)
+    for case in cases:
         error = np.nanmean(endpoint_error(make_flow("dis")(case.first, case.second), case.truth_px))
         assert error == pytest.approx(expected[case.source], abs=0.006)
