@@ -33,7 +33,6 @@ hypothesis.settings.register_profile("ci", max_examples=150, **_EXAMPLES)
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--ci", action="store_true", help="also run the tests marked ci")
-    parser.addoption("--slow", action="store_true", help="also run the tests marked slow, and those marked ci")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -42,12 +41,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    slow = config.getoption("--slow")
-    asked = {"slow": slow, "ci": slow or config.getoption("--ci")}
-    for item in items:
-        for name, is_asked in asked.items():
-            if item.get_closest_marker(name) and not is_asked:
-                item.add_marker(pytest.mark.skip(reason=f"{name}: add --{name} to run it"))
+    if not config.getoption("--ci"):
+        for item in items:
+            if item.get_closest_marker("ci"):
+                item.add_marker(pytest.mark.skip(reason="ci: add --ci to run it"))
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -80,7 +80,7 @@ def _learn(steps: str, devices: int) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_eight_devices_learn_flow_as_one_does():
     one, eight = _learn(FLOW_STEPS, 1), _learn(FLOW_STEPS, 8)
     assert (one["devices"], eight["devices"]) == (1, 8)
@@ -92,7 +92,7 @@ def test_eight_devices_learn_flow_as_one_does():
     assert "batch_size is 6; on 8 devices it must be a multiple of 8" in eight["refused"]
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_eight_devices_learn_tracing_as_one_does():
     one, eight = _learn(CLIP_STEPS, 1), _learn(CLIP_STEPS, 8)
     assert (one["ran"], eight["ran"]) == ([], [8])

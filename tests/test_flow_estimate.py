@@ -616,7 +616,7 @@ def test_the_packaged_fast_flow_sees_a_picture_move():
     "name",
     ["zero", "dis_ultrafast", "dis+wls"]
     + [pytest.param(name, marks=pytest.mark.ci) for name in ("pyramid_fast", "pyramid+rest")]
-    + [pytest.param(name, marks=pytest.mark.slow) for name in ("pyramid", "pyramid_mid")],
+    + [pytest.param(name, marks=pytest.mark.ci) for name in ("pyramid", "pyramid_mid")],
 )
 def test_equal_pictures_have_no_flow_whatever_they_show(name: str) -> None:
     rng = np.random.default_rng(0)

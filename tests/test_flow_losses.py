@@ -419,7 +419,7 @@ def _terms(forward, backward, first, second, settings=SETTINGS, of=level_terms):
     return of(forward, backward, first, second, jnp.ones(()), settings)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_terms_are_summed_over_levels_by_their_weights():
     forward, backward = _pyramid(), _pyramid(seed=9)
     first, second = _colour(seed=0), _colour(seed=5)

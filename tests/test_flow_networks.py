@@ -145,7 +145,7 @@ def test_estimates_go_from_rough_to_the_pictures_size(name, strides):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow) if name.startswith("raft") or name == "pyramid_fast" else name
+        pytest.param(name, marks=pytest.mark.ci) if name.startswith("raft") or name == "pyramid_fast" else name
         for name in TINY
     ],
 )
@@ -156,9 +156,9 @@ def test_from_scratch_the_flow_is_nearly_zero(name):
             assert np.abs(np.asarray(flow)).max() < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(
-    "name", ["pyramid", *(pytest.param(name, marks=pytest.mark.slow) for name in ("flownet_c", "raft_small"))]
+    "name", ["pyramid", *(pytest.param(name, marks=pytest.mark.ci) for name in ("flownet_c", "raft_small"))]
 )
 def test_jit_agrees_with_eager_and_vmap_with_a_loop(name):
     network, pictures = _tiny(name), _pictures(_side(name), _side(name), count=3)
@@ -175,7 +175,7 @@ def test_jit_agrees_with_eager_and_vmap_with_a_loop(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["pyramid", *(pytest.param(name, marks=pytest.mark.slow) for name in ("flownet_c", "raft_small"))]
+    "name", ["pyramid", *(pytest.param(name, marks=pytest.mark.ci) for name in ("flownet_c", "raft_small"))]
 )
 def test_gradients_are_finite_on_any_picture_and_reach_every_weight(name):
     network, side = _tiny(name), _side(name)
@@ -204,10 +204,10 @@ def _loud(network: Any, where: Callable[[Any], Any], gain: float) -> Any:
     return eqx.tree_at(where, network, replace_fn=lambda weight: gain * weight)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("name", "size", "shift"),
-    [("pyramid", 128, 16), pytest.param("raft", 192, 8, marks=pytest.mark.slow)],
+    [("pyramid", 128, 16), pytest.param("raft", 192, 8, marks=pytest.mark.ci)],
 )
 def test_what_moves_with_the_picture_moves_the_flow_along(name, size, shift):
     """A pattern far from the borders, moved by a multiple of the divisor: the same flow, moved."""
@@ -247,7 +247,7 @@ def test_the_flownets_own_unit_does_not_leak_out(name):
 
 
 @pytest.mark.parametrize(
-    "octaves", [(0,), (-1, 0), (0, 1), pytest.param((-1, 0, 1, 2), marks=pytest.mark.slow), (-2, -1, 0)]
+    "octaves", [(0,), (-1, 0), (0, 1), pytest.param((-1, 0, 1, 2), marks=pytest.mark.ci), (-2, -1, 0)]
 )
 def test_octaves_of_the_pyramid_go_on_from_one_another(octaves):
     """With heads that say (1, -2), every correction counts by the stride of its level on its octave."""
@@ -286,7 +286,7 @@ def _lively(network: PyramidFlow) -> PyramidFlow:
     return eqx.tree_at(heads, network, replace_fn=lambda weight: 100 * weight)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_raft_update_answers_for_its_own_correction_only():
     network = _tiny("raft_small")
     for which, answers in (((1.0, 0.0), 1), ((0.0, 1.0), 1), ((1.0, 1.0), 2)):
@@ -295,7 +295,7 @@ def test_a_raft_update_answers_for_its_own_correction_only():
         np.testing.assert_allclose(gradient.update.head.bias, [answers * flows[0][..., 0].size] * 2, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_raft_without_the_volume_is_raft():
     networks = (_tiny("raft_small"), _tiny("raft_small_lean"))
     loud = [_loud(network, lambda n: n.update.head.weight, 300.0) for network in networks]
@@ -310,7 +310,7 @@ def test_raft_without_the_volume_is_raft():
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4 * scale)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_raft_takes_pictures_smaller_than_its_pyramid():
     flows = eqx.filter_eval_shape(_flows, RAFTSmall(updates=1), *[jax.ShapeDtypeStruct((8, 24, 3), jnp.float32)] * 2)
     assert flows[0].shape == (1, 3, 2)
@@ -348,8 +348,7 @@ def test_the_configuration_names_every_setting(name):
     assert _count(eqx.filter_eval_shape(lambda: build(settings))) == _count(eqx.filter_eval_shape(PUBLISHED[name]))
 
 
-@pytest.mark.slow
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("name", ["flownet_s", "flownet_c"])
 def test_flownet_at_full_width_runs(name):
     network = eqx.filter_jit(PUBLISHED[name])()

@@ -163,7 +163,7 @@ def test_vmap_is_a_loop(pairs):
             assert np.mean(np.abs(np.asarray(a, np.float32) - b[i].astype(np.float32)) > 1e-3) < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_eager_is_jitted():
     small = dataclasses.replace(NOISY, height=16, width=16, num_layers=(2, 2))
     key = jax.random.key(2)
@@ -172,7 +172,7 @@ def test_eager_is_jitted():
         assert np.mean(np.abs(np.asarray(a, np.float32) - np.asarray(b, np.float32)) > 1e-3) < 5e-3
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_light_noise_and_photographs_change_the_pictures_and_not_the_flow(pairs):
     photographs = jax.random.bits(jax.random.key(9), (2, 20, 30, 3), jnp.uint8)
     noisy = jax.device_get(flow_pairs(NOISY, BATCH, photographs, key=jax.random.key(1)))
@@ -187,7 +187,7 @@ def test_light_noise_and_photographs_change_the_pictures_and_not_the_flow(pairs)
     assert len({a.tobytes() for a in noisy.first}) == BATCH
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_motion_is_mostly_small_partly_zero_and_sometimes_large():
     """Over 256 default pairs at 1/4 of the pixels; the bounds leave room for other random numbers."""
     settings = FlowPairSettings()

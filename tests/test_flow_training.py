@@ -561,7 +561,7 @@ def test_step_learns_counts_and_skips_what_is_not_finite() -> None:
         flow_step(state, [], optimizer, settings, 10.0)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_recurrent_network_learns_by_its_sequence_beyond_the_crop() -> None:
     settings = FlowLossSettings(census_radius=1, census_stride=1, sequence_decay=0.8)
     optimizer = optax.adam(1e-3)
@@ -582,7 +582,7 @@ def test_a_recurrent_network_learns_by_its_sequence_beyond_the_crop() -> None:
         flow_step(FlowTrainState.create(small_network(), optimizer, seed=0), samples, optimizer, settings, 10.0)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_average_of_the_weights_is_the_mean_at_first_and_a_running_one_later() -> None:
     settings = FlowLossSettings(census_radius=1, census_stride=1)
     optimizer = optax.sgd(0.1)
@@ -615,7 +615,7 @@ class ShiftingNetwork(AbstractFlowNetwork):
         return (jnp.zeros((height, width, 2)).at[..., 0].set(right),)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     settings = FlowLossSettings(census_radius=1, census_stride=1, occlusion_after=5)
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
@@ -628,7 +628,7 @@ def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     assert shares[1] == 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_teacher_is_heard_late_and_then_ramped() -> None:
     settings = FlowLossSettings(
         census_radius=1, census_stride=1, self_supervision=1.0, self_supervision_after=10, self_supervision_ramp=10,
@@ -663,7 +663,7 @@ def configured(tmp_path: Path, **more) -> TrainFlowConfig:
     return dataclasses.replace(config, data=dataclasses.replace(config.data, drawn=drawn(tmp_path / "drawn")))
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> None:
     (tmp_path / "walk").mkdir()
     for number in range(3):  # one picture, shifted by two pixels each time
@@ -681,7 +681,7 @@ def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> No
     assert (tmp_path / "run" / "weights.safetensors").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_interrupted_run_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import tagjax.training.flow_run as module
 

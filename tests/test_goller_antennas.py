@@ -176,7 +176,7 @@ def test_one_frame_and_frames_at_one_time_are_finite():
         np.testing.assert_array_equal(path.velocity_m_s, np.zeros_like(path.velocity_m_s))
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_gradients_of_the_location(gradients_agree):
     grid = make_grid((-1.0, -1.0), (5.0, 1.0), 1.0)
     received = jnp.asarray(RNG.random((6, 3)) < 0.7).at[0].set(True)

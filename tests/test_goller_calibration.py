@@ -161,7 +161,7 @@ def test_a_damaged_calibration_is_refused_by_name(calibration, tmp_path, name, v
         load_calibration(path)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_training_lowers_the_loss_and_keeps_the_antennas(shop, calibration):
     examples = [(observe(shop, scenes.LOOKING_DOWN), true_tags(shop))]
     fitted, losses = fit_association(calibration, examples, scenes.LOOKING_DOWN, num_steps=12, learning_rate=0.1)

@@ -146,7 +146,7 @@ def test_missing_recordings_are_named_before_any_is_opened(tmp_path):
     assert dataclasses.replace(config, handover=str(there.parents[1])).handover_recordings() == [str(there)]
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_run_writes_tables_metrics_and_plots(tmp_path):
     save_recording(scenes.grid_recording(), tmp_path / "grid.zarr")
     leaves, stays = scenes.straight((4.6, 0.3), (-1.6, 0.3)), scenes.straight((4.6, 0.3), (2.4, 0.3))

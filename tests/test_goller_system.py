@@ -132,7 +132,7 @@ def test_another_number_of_antennas_is_refused(shop, calibration):
     assert "calibrated are 3" in (GollerTracer(calibration, scenes.LOOKING_DOWN).inapplicable(fewer) or "")
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
     tracer = GollerTracer(calibration, scenes.LOOKING_DOWN).install(shop)
     traces = list(host_trace(tracer, shop))

@@ -102,7 +102,7 @@ def _in_double(tree):
     return jax.tree.map(lambda leaf: wide(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_loss_moves_as_its_gradient_says(clip):
     """Flow weights, alpha, beta, v0 and the gate's width through one objective, against central differences in x64."""
     with jax.enable_x64(True):
@@ -159,7 +159,7 @@ def test_settings_that_no_joint_run_can_have():
         from_mapping(TrainConfig, {**base, "joint": {**least, "loss": {"self_supervision": 0.3}}})
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_joint_run_learns_both_resumes_exactly_and_is_evaluated_with_its_own_flow(tmp_path: Path):
     from tagjax.evaluation.run import restore_state
 

@@ -155,7 +155,7 @@ def test_smoothing_that_the_tracer_cannot_do_is_refused_before_the_work(recordin
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_run_may_be_scored_smoothed(recordings: list[str], tmp_path: Path) -> None:
     values = _values(recordings)
     values["scores"]["smooth"] = True
@@ -201,7 +201,7 @@ def test_label_pictures_are_whole_and_of_the_frames_size(tmp_path: Path) -> None
         with_virtual_tags(recording, settings)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_command_lines(recordings: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
     common = [sys.executable, "-m"]

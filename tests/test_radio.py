@@ -347,7 +347,7 @@ def test_refined_paths_have_the_gradient_of_their_reads(gradients_agree):
     gradients_agree(path, (reads.phase_rad,), atol=1e-5, rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_windowed_distances_have_the_gradient_of_the_phases(gradients_agree):
     rng = np.random.default_rng(0)
     table = simulate_reads(rng, smooth_path(rng, 0.8, 1.2), 1.2)
@@ -497,7 +497,7 @@ def test_window_reads_are_those_of_the_window():
     np.testing.assert_allclose(np.asarray(few.time_s[5]), [0.44, 0.46, 0.48, 0.5], atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_jit_and_vmap_change_nothing():
     rng = np.random.default_rng(0)
     pair = [phase_reads(simulate_reads(rng, smooth_path(rng, 1.0, 3), 3), "A", 0) for _ in range(2)]

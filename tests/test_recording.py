@@ -12,6 +12,7 @@ import threading
 import time
 from pathlib import Path
 
+import fsspec
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
@@ -56,7 +57,6 @@ def test_round_trip(recording, tmp_path):
 
 
 def test_remote_store(recording):
-    fsspec = pytest.importorskip("fsspec")
     address = "memory://somewhere/a.zarr"
     write_recording(recording, zarr.open_group(address, mode="w", zarr_format=3))
     again = open_recording(address)
@@ -247,7 +247,7 @@ def test_what_cannot_be_stored_is_refused_before_any_frame_is_written(recording,
 @pytest.fixture
 def web(tmp_path):
     """A web server of the folder `tmp_path`: its address, the paths asked for, and a switch that makes it fail."""
-    pytest.importorskip("aiohttp")
+    pytest.importorskip("aiohttp", reason="needs the remote extra")
     asked: list[str] = []
     broken = threading.Event()
 
@@ -271,6 +271,7 @@ def web(tmp_path):
     thread.join()
 
 
+@pytest.mark.ci
 def test_a_web_server_serves_frames_as_they_are_asked_for(recording, tmp_path, web):
     address, asked, broken = web
     noisy = np.random.default_rng(0).integers(1, 255, recording.colour.shape).astype(np.uint8)
@@ -293,6 +294,7 @@ def test_a_web_server_serves_frames_as_they_are_asked_for(recording, tmp_path, w
         again.depth_metres(slice(2, 4))
 
 
+@pytest.mark.ci
 def test_a_web_address_without_a_recording_is_an_error(recording, tmp_path, web):
     address, _, broken = web
     with pytest.raises(RecordingError, match="no readable Zarr v3 group"):

@@ -132,7 +132,7 @@ def test_the_misalignment_told_is_the_one_there_is(estimated) -> None:
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("shift_px", [(0.0, 0.0), pytest.param((14.0, -17.0), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shift_px", [(0.0, 0.0), pytest.param((14.0, -17.0), marks=pytest.mark.ci)])
 def test_right_is_left_where_it_is_and_far_off_is_brought_back(estimated, shift_px) -> None:
     told, (colour, depth), _, _ = estimated
     right = told.corrected(RESIDUAL)
@@ -221,7 +221,7 @@ def test_a_folder_that_is_registered_takes_no_correction(tmp_path) -> None:
         import_recording(ImportSettings(video=str(tmp_path), video_format="tum", correction="estimate"))
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.real_data
 @pytest.mark.parametrize(("name", "step"), [("ist-confusao", 8), ("ist-imgseq1", 4)])
 def test_a_real_residual_is_mended_in_held_out_frames(real_data, name, step) -> None:

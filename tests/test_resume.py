@@ -109,7 +109,7 @@ def _same(one: Path, two: Path) -> None:
     assert lines[0] == lines[1]
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.filterwarnings("ignore")  # Orbax guesses shardings when told none
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_killed_run_resumes_bit_for_bit(recording: str, tmp_path: Path, workers: int) -> None:
@@ -132,7 +132,7 @@ def _command(process: psutil.Process) -> list[str]:
         return ["spawn_main"]  # gone already
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.filterwarnings("ignore")
 def test_a_killed_flow_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     straight, broken = tmp_path / "straight", tmp_path / "broken"
@@ -186,7 +186,7 @@ def test_shares_of_a_stream_are_the_stream_and_places_are_common() -> None:
         whole.set_state({"place": 3})
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_workers_load_the_same_clips_and_go_on_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # as `conftest` has it: a worker compiles as this process
     plain, helped = _clips(), _clips(workers=2)

@@ -84,7 +84,7 @@ def test_pool_and_unpool_are_adjoint():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_segmentation_survives_a_frame_without_depth_and_its_gradient_too():
     nothing = jnp.zeros((16, 16), dtype=bool)
 
@@ -98,7 +98,7 @@ def test_segmentation_survives_a_frame_without_depth_and_its_gradient_too():
     assert bool(jnp.isfinite(gradient).all())
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_temperature_gradient_agrees_with_finite_differences(gradients_agree):
     points = np.asarray(_two_planes(8, 8, 3))
 

@@ -159,7 +159,7 @@ def _load(one: Recording, start: int, stop: int, *, epcs: Sequence[str]) -> Clip
     return load_clip(one, start, stop, stride=1, flow="zero", epcs=epcs)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_first_frame_shows_what_the_later_ones_tell(recording: Recording) -> None:
     """Whoever only looks forwards knows nothing yet."""
     settings = ScoreSettings(frames_at_once=7)
@@ -181,7 +181,7 @@ def test_the_first_frame_shows_what_the_later_ones_tell(recording: Recording) ->
         assert not filtered.detected[tag]
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_pieces_and_groups_give_what_two_scans_give(recording: Recording) -> None:
     tracer = _tracer(rivalry=1e-12)  # so that tags can be traced one at a time
     settings = ScoreSettings(frames_at_once=7, tags_at_once=1, smooth=True)
@@ -194,7 +194,7 @@ def test_pieces_and_groups_give_what_two_scans_give(recording: Recording) -> Non
         np.testing.assert_allclose(out.confidence, whole.confidence[number], atol=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
     clip = load_clip(recording, 0, 6, stride=1, flow="zero", epcs=EPCS)
     turned = load_clip(time_reversed(recording), NUM_FRAMES - 6, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)

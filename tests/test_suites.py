@@ -100,7 +100,7 @@ def _speed(path_m: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.diff(path_m, axis=0), axis=1) / STEP_S
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_every_train_has_the_number_of_traces_of_its_variant():
     """All items: intervals in which any point of the train is within the picture and not occluded by any body."""
     suite = _named("separated_traces")
@@ -132,7 +132,7 @@ def test_the_masks_appear_and_disappear_as_often(variant):
         np.testing.assert_array_equal(shown, truth.visible[label])
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_every_person_enters_and_leaves():
     """All items: no limb and no object is visible at either end; each person is visible in between."""
     suite = _named("enter_leave")
@@ -184,7 +184,7 @@ def _shop_items(name: str, all_items: bool) -> list:
     return items if all_items else [item for item in items if item.split == "test" and item.number == 0]
 
 
-@pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.ci)])
 def test_the_shop_agrees_with_the_paper(all_items):
     """The same shop always; level dipoles; static tags on a box near the exit; carried tags leave, or never come near it."""
     furniture: dict[str, set] = {}
@@ -228,7 +228,7 @@ def test_the_shop_agrees_with_the_paper(all_items):
     assert not all_items or 0.1 < stayed / carried < 0.35
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_exits_antenna_reads_the_static_tags_all_the_time():
     """First recordings: at least one read by the exit's antenna in every second, of every tag on the box."""
     for item in _shop_items("shop_exit", all_items=False):
@@ -244,7 +244,7 @@ def test_the_exits_antenna_reads_the_static_tags_all_the_time():
             assert len(second) > 0.8 * item.suite.duration_s, (item.name, epc)
 
 
-@pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("all_items", [False, pytest.param(True, marks=pytest.mark.ci)])
 def test_an_object_is_handed_over_and_put_onto_a_box(all_items):
     """The first person holds it until they meet, then the second one, then it is stationary; both people leave."""
     for item in _shop_items("shop_handover", all_items):
@@ -422,14 +422,14 @@ def test_a_killed_run_resumes_and_repeats_exactly(tmp_path):
     assert len(recording.truth.tag_to_label) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_workers_change_nothing(tmp_path):
     make_suite(_tiny(), tmp_path / "one")
     make_suite(_tiny(), tmp_path / "two", workers=2)
     assert _digest(tmp_path / "one") == _digest(tmp_path / "two")
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_suite_in_small(path, tmp_path):
     suite = _suite(path).smoke()

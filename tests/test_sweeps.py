@@ -86,7 +86,7 @@ LAUNCHERS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_every_launcher_runs_a_sweep(recordings: list[str], tmp_path: Path, launcher: list[str]) -> None:
     _run(_evaluate(recordings, tmp_path, *launcher))
@@ -105,7 +105,7 @@ def _states(storage: Path) -> list[tuple[int, str]]:
         return []  # not yet made
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 @_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
 def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) -> None:
     storage = tmp_path / "optuna.db"
@@ -138,6 +138,7 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
 
 
 @pytest.mark.filterwarnings("ignore")  # Optuna's and SQLAlchemy's own
+@pytest.mark.ci
 @_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
 def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
     import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
@@ -195,9 +196,10 @@ def _sweep_objective(folder: Path, *more: str, ended: str = "") -> subprocess.Co
 
 @pytest.mark.parametrize(
     "launcher",
-    [[], pytest.param(LAUNCHERS[1].values[0], marks=pytest.mark.slow)],
+    [[], LAUNCHERS[1].values[0]],
     ids=["basic", "joblib"],
 )
+@pytest.mark.ci
 @_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
 def test_a_search_s_trials_have_folders_of_their_own_and_may_fail(tmp_path: Path, launcher: list[str]) -> None:
     storage = tmp_path / "optuna.db"
@@ -226,6 +228,7 @@ def test_a_stopped_run_ends_its_sweep(tmp_path: Path) -> None:
     assert not (tmp_path / "sweep" / "1").exists()
 
 
+@pytest.mark.ci
 @_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
 def test_a_search_without_held_out_recordings_is_refused(tmp_path: Path) -> None:
     storage = f"hydra.sweeper.storage=sqlite:///{tmp_path / 'optuna.db'}"
@@ -261,7 +264,7 @@ def _config(folder: Path, **settings) -> SweepConfig:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_a_grid_is_swept_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config(tmp_path / "recordings", smoke=True)
     lines = run_sweep(config, tmp_path / "sweep")

@@ -192,8 +192,8 @@ def test_formats_are_told_apart_by_their_headers():
     ("path", "name", "rate"),
     [
         ("sllurp-hopping/static/1ft.csv", "sllurp", (69, 71)),
-        pytest.param("sllurp-hopping/static/7ft.csv", "sllurp", (69, 71), marks=pytest.mark.slow),
-        pytest.param("tagbeat/D_100cm.csv", "tagbeat", (110, 120), marks=pytest.mark.slow),
+        pytest.param("sllurp-hopping/static/7ft.csv", "sllurp", (69, 71), marks=pytest.mark.ci),
+        pytest.param("tagbeat/D_100cm.csv", "tagbeat", (110, 120), marks=pytest.mark.ci),
         ("tagbeat/rpm187.csv", "tagbeat", (145, 150)),
         ("antenna-rail/rail_50_positions.csv", "antenna_rail", (249, 251)),
     ],

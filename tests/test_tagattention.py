@@ -170,7 +170,7 @@ def test_a_second_antenna_splits_what_one_cannot():
         TagAttentionPaper().init(camera, jax.tree.map(lambda leaf: leaf[0], frames))
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_scan_is_the_loop_of_steps(clip):
     tracer = _learnable()
     few = jax.tree.map(lambda leaf: leaf[:5], clip.frames)
@@ -214,7 +214,7 @@ def _degenerate(frames: Frame):
     "tracer",
     [
         pytest.param(_learnable(rest_doubt=0.3), id="learnable", marks=pytest.mark.ci),
-        pytest.param(TagAttentionPaper(cell=4), id="paper", marks=pytest.mark.slow),
+        pytest.param(TagAttentionPaper(cell=4), id="paper", marks=pytest.mark.ci),
     ],
 )
 def test_gradients_reach_every_parameter_and_stay_finite_at_degenerate_input(clip, tracer):

@@ -109,7 +109,7 @@ def test_interpolation_is_constant_beyond_the_ends():
     assert whole[2] == 4.0
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_interpolation_has_gradients(gradients_agree):
     rng = np.random.default_rng(3)
     time, value = np.cumsum(rng.uniform(0.1, 0.3, 7)), rng.normal(size=7)

@@ -140,7 +140,7 @@ def test_offsets_are_inverted_and_every_object_has_a_target():
     assert set(ignored) == {0, -1}
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_the_loss_counts_the_hardest_negatives_and_has_gradients():
     network = BoxNetwork((4, 6, 8), 1, key=jax.random.key(0))
     images = jax.random.uniform(jax.random.key(1), (2, 16, 16, 3))
@@ -172,7 +172,7 @@ def _pictures(count, seed=0, size=(48, 64)):
     return frames
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_training_lowers_the_loss_and_weights_are_read_back(tmp_path):
     settings = TrainSettings(
         num_steps=60, batch_size=4, crop_px=(32, 48), widths=(4, 8, 8), depth=1, learning_rate=0.01

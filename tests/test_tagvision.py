@@ -423,7 +423,7 @@ def test_a_suite_of_lines_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_planar_tracks_run_whole(tmp_path: Path) -> None:
     values = _compose(
         "tagvision", "benchmark=planar_tracks", "benchmark.duration_s=4.0", "benchmark.counts.test=1", "num_calibrations=1",

@@ -182,7 +182,7 @@ def test_the_configuration_names_every_setting():
     assert set(values) == {field.name for field in dataclasses.fields(TracksConfig)}
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path):
     """Without noise, flips or hops a window of 4 s suffices for all of them; a run writes what it found."""
     config = TracksConfig(
@@ -206,7 +206,7 @@ def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path)
 
 
 @pytest.mark.real_data
-@pytest.mark.slow
+@pytest.mark.ci
 def test_real_tracks_tell_the_carrier_better_the_longer_one_looks(real_data, tmp_path):
     rows = run_tracks(TracksConfig(str(real_data / "tracks"), windows_s=(1.0, 4.0), max_windows=16), tmp_path)["rows"]
     assert {row["scene"] for row in rows} == {"kinect-rfid", "xovis-uwb"}

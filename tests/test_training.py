@@ -258,7 +258,7 @@ def test_a_clip_without_reads_or_depth_gives_finite_gradients() -> None:
         assert np.isfinite(float(logged["loss"]))
 
 
-@pytest.mark.parametrize("evidence", ["coherence", pytest.param("likelihood", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("evidence", ["coherence", pytest.param("likelihood", marks=pytest.mark.ci)])
 def test_gradient_agrees_with_finite_differences(evidence: Literal["coherence", "likelihood"]) -> None:
     settings = dataclasses.replace(SETTINGS, evidence=evidence)
     with jax.enable_x64(True):
@@ -281,7 +281,7 @@ def test_gradient_agrees_with_finite_differences(evidence: Literal["coherence", 
         assert float(logged["loss"]) == pytest.approx(float(loss(level)), rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_rematerialising_changes_nothing_but_memory() -> None:
     clip = _clip(12)
     kept = ObjectiveSettings(span_frames=8, skip_frames=4, future_stride=1, rematerialise=False)
