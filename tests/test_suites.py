@@ -298,9 +298,9 @@ def test_the_grid_has_a_level_dipole_in_two_directions():
 @pytest.mark.parametrize(("name", "variant"), [("planar_tracks", "three"), ("shop_exit", "sp_mt_4")])
 def test_objects_do_not_pass_through_each_other(name, variant):
     """All items: the bounding boxes of two objects, rotated about the vertical, never overlap."""
-    for item in _named(name).items():
-        if item.variant.name != variant:
-            continue
+    items = [item for item in _named(name).items() if item.variant.name == variant]
+    assert items
+    for item in items:
         scenario = item_scenario(item)
         objects = [scenario.world.bodies[tag.body] for tag in scenario.world.tags]
         for one, other in itertools.combinations(objects, 2):
