@@ -1,7 +1,7 @@
 """Two small simulated recordings, traced end to end by the command lines that users run, and the scores recorded for them.
 
 python tests/accuracy_gate.py --record                        # simulate, trace, and write the scores of this code
-python tests/accuracy_gate.py --record "walking people"       # of that one only
+python tests/accuracy_gate.py --record "hand-held object"     # of that one only
 
 Programs are started anew with XLA's normal optimisations, which the tests' own process switches off.
 """
@@ -34,6 +34,11 @@ class Case:
 
 CASES = {
     "walking people": Case("walkers", (), ("weights=default",)),
+    "hand-held object": Case(
+        "single_static",
+        ("duration_s=3.5", "variants=[{name: box, settings: {kinds: [box]}}]"),
+        ("tracer=tagattention_handheld", "clips.stride=2", "scores=handheld"),
+    ),
 }
 
 
