@@ -64,6 +64,6 @@ def write_config(values: Mapping[str, Any], folder: Path) -> None:
 
 def print_result(result: Any) -> None:
     """Print a result as JSON, the last line of a command's output."""
-    from tagjax.report.report import plain
+    from tagjax.core.results import to_json_values
 
-    print(json.dumps(plain(result), allow_nan=False))
+    print(json.dumps(to_json_values(result), allow_nan=False))

@@ -17,11 +17,12 @@ import pytest
 import synthetic_clips as synthetic
 from rich.console import Console
 
+from tagjax.core.results import to_json_values
 from tagjax.metrics.recordings import ScoreSettings, box_to_picture, evaluate_recording, mask_to_picture, score_traces
 from tagjax.metrics.tracking import box_iou, label_box
 from tagjax.recording import RecordingError
 from tagjax.report.overlay import MIN_WIDTH, _extent, _free_place
-from tagjax.report.report import plain, score_table, summarise, write_report
+from tagjax.report.report import score_table, summarise, write_report
 from tagjax.tagattention import TagAttention
 from tagjax.tagattention.frame_trace import describe
 from tagjax.tracing.recordings import _tags, trace_recording
@@ -194,7 +195,7 @@ def test_report_is_complete(tmp_path: Path) -> None:
         ],
     }
     summary = write_report(tmp_path, results)
-    assert json.loads((tmp_path / "metrics.json").read_text()) == plain(summary)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == to_json_values(summary)
     assert summary["learned"]["all"]["iou"] > summary["blunt"]["all"]["iou"]
     with (tmp_path / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -227,7 +228,7 @@ def test_the_table_fits_a_terminal_of_eighty_columns() -> None:
 
 def test_plain_json_has_no_nan() -> None:
     odd = {"a": [np.float32(1.5), float("nan")], "b": {"c": np.arange(2), 3: np.bool_(True)}, "d": float("inf")}
-    assert json.loads(json.dumps(plain(odd), allow_nan=False)) == {
+    assert json.loads(json.dumps(to_json_values(odd), allow_nan=False)) == {
         "a": [1.5, None],
         "b": {"c": [0, 1], "3": True},
         "d": None,

@@ -17,11 +17,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from ..core.machine import machine
+from ..core.results import write_json
 from ..flow.opencv import FlowFunction
 from ..flow.registry import flow_key, make_flow, split_suffixes
 from ..metrics.flow import FlowScores, endpoint_error, warped_error
 from ..report.flow import flow_panel
-from ..report.report import write_json
 from ..sim.flow_pairs import FlowPairSettings
 from .flow_cases import FlowCase, Material, drawn_material, folder_material, recording_material, sequence_material
 

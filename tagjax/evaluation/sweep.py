@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from ..core.results import to_json_values
 from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording.store import open_recording
-from ..report.report import plain
 from ..report.sweep import curve_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
 from ..tagattention.tracer_settings import make_tracer, tracer_clips
@@ -191,7 +191,7 @@ def frame_iou(result: RecordingResult) -> tuple[float | None, ...]:
 
 def _append(path: Path, line: Line) -> None:
     with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(plain(dataclasses.asdict(line))) + "\n")
+        file.write(json.dumps(to_json_values(dataclasses.asdict(line))) + "\n")
 
 
 def read_lines(path: Path) -> list[Line]:

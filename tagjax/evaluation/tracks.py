@@ -20,12 +20,12 @@ from jaxtyping import Array, Float, Shaped
 from ..baselines.tagview.line_fit import fit_pairs
 from ..baselines.tagview.sequences import ReadSettings, tag_measurements
 from ..baselines.tagvision.phase_score import Snapshots, match_scores
+from ..core.results import write_json
 from ..radio.channels import estimate_slope
 from ..radio.reader import ReaderSettings
 from ..recording import RecordingError, TagReads
 from ..recording.importers.tagged_walks import load_tagged, load_uwb, read_kinect, read_xovis
 from ..recording.virtual_tags import Track, virtual_reads
-from ..report.report import write_json
 from ..tagattention.attention import att_corr, att_rbf, attention, coherent_score
 from ..tracing.range_windows import phase_reads, radio_windows
 from .real_tags import SCORES, associate, speed_scores, speed_windows

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +13,7 @@ import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 
-from ..core.files import write_atomic
+from ..core.results import write_json
 from ..metrics.recordings import RecordingResult
 from ..metrics.tracking import Scores, label_box
 from .overlay import draw_overlay, short_name
@@ -38,26 +36,6 @@ def summarise(results: Results) -> dict[str, Any]:
             recordings[_recording_name(ones, number)] = {"all": one.scores().result(), "tags": tags}
         summary[tracer] = {"all": total.result(), "recordings": recordings}
     return summary
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file that appears whole or not at all. NaN and infinity become null."""
-    write_atomic(path, json.dumps(plain(content), indent=2) + "\n")
-
-
-def plain(content: Any) -> Any:
-    """Convert to numbers, strings, lists and dictionaries; numbers that are not finite become None."""
-    if isinstance(content, Mapping):
-        return {str(key): plain(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [plain(value) for value in content]
-    if isinstance(content, np.ndarray):
-        return plain(content.tolist())
-    if isinstance(content, np.generic):
-        return plain(content.item())
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content
 
 
 def write_report(folder: Path, results: Results) -> dict[str, Any]:

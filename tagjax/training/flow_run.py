@@ -17,6 +17,7 @@ from rich.table import Table
 
 from ..core.build import build
 from ..core.machine import machine
+from ..core.results import write_json
 from ..flow.augmentation import AugmentationSettings
 from ..flow.estimates import NetworkFlow, forward_flow
 from ..flow.image_sequences import open_sequence
@@ -25,7 +26,6 @@ from ..flow.network import AbstractFlowNetwork
 from ..flow.registry import make_flow
 from ..flow.weights import load_weights, save_weights
 from ..metrics.flow import FlowScores
-from ..report.report import write_json
 from ..sim.flow_pairs import FlowPair
 from .checkpoint import Checkpoints
 from .devices import check_batch, local

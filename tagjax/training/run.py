@@ -14,10 +14,11 @@ from rich.console import Console
 from rich.progress import track
 
 from ..core.build import build
+from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
-from ..report.report import plain, score_table, write_json, write_report
+from ..report.report import score_table, write_report
 from ..tagattention import TagAttention
 from ..tagattention.learned import save_parameters
 from ..tagattention.tracer_settings import make_tracer
@@ -183,8 +184,8 @@ def _keep_learned(
     if isinstance(tracers["learned"], TagAttention):
         recipe = dataclasses.asdict(config) | {"steps": int(state.step)}
         clips = dataclasses.asdict(config.data.clips) | {"flow": flows["learned"]}
-        about = plain({"recipe": recipe})
-        save_parameters(folder / "weights.json", tracers["learned"], config.tracer, plain(clips), about)
+        about = to_json_values({"recipe": recipe})
+        save_parameters(folder / "weights.json", tracers["learned"], config.tracer, to_json_values(clips), about)
     write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
     return tracers, flows
 

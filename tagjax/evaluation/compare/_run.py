@@ -13,13 +13,13 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
+from ...core.results import write_json
 from ...core.settings import ConfigError, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
 from ...metrics.tracking import Scores
 from ...recording import Recording, RecordingError
 from ...recording.store import open_recording
 from ...report.comparison import bar_plot
-from ...report.report import write_json
 from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_items
 from ...tracing.tracer import Trace
 from ._systems import NAMES, Systems, SystemSettings

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...core.results import to_json_values, write_json
 from ...core.settings import ConfigError, changed, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ...recording.store import open_recording
-from ...report.report import plain, write_json
 from ...sim.suites import Item, Suite, make_items
 from ...tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
 from ...tracing.clips import ClipSettings, clip_loader
@@ -114,7 +114,7 @@ class Tracing:
             "frames": self.frames,
             "code": {path: content for path, content in code.items() if not path.endswith((".yaml", ".json"))},
         }
-        return json.loads(json.dumps(plain(everything)))
+        return json.loads(json.dumps(to_json_values(everything)))
 
 
 def _tracing(recipe: Recipe, inputs: Inputs, job: Job) -> Tracing:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...core.machine import machine
-from ...report.report import write_json
+from ...core.results import write_json
 from .interval import LEVEL, NUM_RESAMPLES, SEED, ratio_estimate
 from .provenance import dependencies, revision
 from .recipe import COUNTS, Column, Job, Recipe, Row
