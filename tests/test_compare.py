@@ -25,8 +25,8 @@ from tagjax.baselines.goller.location import make_location
 from tagjax.baselines.goller.matching import make_association
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
-from tagjax.evaluation.compare._run import _score, _Tally
-from tagjax.evaluation.compare._table import bars, write_csv
+from tagjax.evaluation.compare.run import _score, _Tally
+from tagjax.evaluation.compare.table import bars, write_csv
 from tagjax.report.comparison import bar_plot
 from tagjax.sim.suites import Item, Suite, Variant
 from tagjax.tracing.tracer import Trace

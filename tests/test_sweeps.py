@@ -414,13 +414,13 @@ def test_wandb_out_of_reach_or_lost_ends_no_run(tmp_path: Path, monkeypatch: pyt
     with pytest.warns(UserWarning, match=r"cannot be reached: CommError: Run init.* 90\.0 sec\. Logging offline"):
         logger = Logger(tmp_path, LoggerSettings(mode="online"))
     with pytest.warns(
-        UserWarning, match=r"did not take a step's numbers: RuntimeError: the service has gone\. The run"
+        UserWarning, match=r"could not log a step's numbers: RuntimeError: the service has gone\. The run"
     ):
         logger.write(1, {"loss": 0.5})
     picture = tmp_path / "report" / "curves" / "a.png"
     picture.parent.mkdir(parents=True)
     cv2.imwrite(str(picture), np.full((8, 8, 3), 90, np.uint8))
-    with pytest.warns(UserWarning, match="did not take the report"):
+    with pytest.warns(UserWarning, match="could not log the report"):
         logger.report(tmp_path / "report", {"iou": 0.25}, tracer="learned")
     with pytest.warns(UserWarning, match="did not take the end of the run: BrokenPipeError: no service"):
         logger.close()

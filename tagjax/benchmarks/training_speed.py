@@ -18,7 +18,7 @@ from ..sim.record import CaptureSettings, simulate_recording
 from ..sim.stories import build_scenario
 from ..tagattention import TagAttention
 from ..tracing.clips import Clip, ClipSettings, load_clip
-from ..training.loss import ObjectiveSettings
+from ..training.objective import ObjectiveSettings
 from ..training.state import TrainState
 from ..training.step import make_optimizer, train_step
 from .timing import Timing, in_own_process, peak_memory_mib

@@ -69,7 +69,7 @@ def drawn_material(
 def recording_material(paths: tuple[str, ...], *, every: int, most: int) -> Material:
     """Every `every`-th frame and the next of recordings, `most` of each; with their exact flow where they hold it."""
     recordings = [open_recording(path) for path in paths]
-    names = _told_apart([recording.name for recording in recordings])
+    names = _unique_names([recording.name for recording in recordings])
     frames = [_chosen(recording.num_frames, every, most, recording.name) for recording in recordings]
 
     def cases() -> Iterator[FlowCase]:
@@ -111,7 +111,7 @@ def folder_material(path: str) -> Material:
 
 def sequence_material(paths: tuple[str, ...], cache: Path, *, every: int, most: int) -> Material:
     """Every `every`-th picture and the next of videos and folders of pictures, `most` of each; without truth."""
-    names = _told_apart([Path(path).stem for path in paths])
+    names = _unique_names([Path(path).stem for path in paths])
     sequences = [(name, open_sequence(path, cache)) for name, path in zip(names, paths, strict=True)]
     frames = [_chosen(sequence.shape[0], every, most, name) for name, sequence in sequences]
 
@@ -123,7 +123,7 @@ def sequence_material(paths: tuple[str, ...], cache: Path, *, every: int, most: 
     return Material("without truth", sum(map(len, frames)), cases)
 
 
-def _told_apart(names: Sequence[str]) -> list[str]:
+def _unique_names(names: Sequence[str]) -> list[str]:
     """The names, numbered where several are alike."""
     return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names)]
 

@@ -18,7 +18,7 @@ from ...sim.suites import Item, Suite, make_items
 from ...tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
-from ...training.run import parameters
+from ...training.evaluate import parameters
 from .recipe import Job, Recipe
 from .scores import RecordingScores
 

@@ -22,8 +22,8 @@ from ...recording.store import open_recording
 from ...report.comparison import bar_plot
 from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_items
 from ...tracing.tracer import Trace
-from ._systems import NAMES, Systems, SystemSettings
-from ._table import LEGEND, MEASURES, SHORT, Cell, bars, markdown, said, write_csv
+from .systems import NAMES, Systems, SystemSettings
+from .table import LEGEND, MEASURES, SHORT, Cell, bars, markdown, said, write_csv
 
 Claims = tuple[np.ndarray, np.ndarray]
 """Of every tag at one frame: its place in metres (tag, 3), and whether an object is claimed at all (tag,)."""
