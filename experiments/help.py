@@ -1,7 +1,7 @@
 """The text of `--help`: what the command does, its groups with their choices, and every key with its comment.
 
-Hydra prints it, for conf/hydra/default.yaml names it as the help's template. So overrides count: with
-`--help tracer=tagattention_paper` the keys of that tracer are shown.
+It is the help template in conf/hydra/default.yaml, so overrides have an effect: `--help tracer=tagattention_paper` shows
+the keys of that tracer.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .yaml_comments import key_comments, lines_with_keys
 
 
 def command_help(conf: Path, *, _root_: DictConfig) -> str:
-    """The help of the command that the composed configuration `_root_` is of; `conf` is the folder of the configuration."""
+    """The help of the command with the composed configuration `_root_`; `conf` is the folder of the configuration."""
     name = str(_root_.hydra.job.name)
     choices = {str(group): choice for group, choice in _root_.hydra.runtime.choices.items()}
     about = importlib.import_module(f"{__package__}.{name}").__doc__ or ""
@@ -30,7 +30,7 @@ def command_help(conf: Path, *, _root_: DictConfig) -> str:
             about.strip(),
             "\n".join(["Groups (group=choice; a choice is a file conf/<group>/<choice>.yaml):", *groups]),
             f"Keys (name=value, a.b=value) and their values as composed:\n{_keys(conf, name, choices, _root_)}",
-            "`--help group=choice` shows the keys of that choice; `--hydra-help` is about Hydra's own options.",
+            "`--help group=choice` shows the keys of that choice; `--hydra-help` explains Hydra's own options.",
         ]
     )
     return text.replace("$", "$$")  # Hydra takes the text as a string.Template
@@ -49,7 +49,7 @@ def _keys(conf: Path, name: str, choices: dict[str, str | None], config: DictCon
     comments = dict(key_comments(conf / f"{name}.yaml", ""))
     for group, choice in choices.items():
         folder, _, package = group.partition("@")
-        # A key without a comment of its own has that of the group's default.
+        # A key without a comment gets the comment of the group's default.
         for path in [*_chain(conf / folder / "default.yaml"), *_chain(conf / folder / f"{choice}.yaml")]:
             comments |= dict(key_comments(path, package or folder.replace("/", ".")))
     own = OmegaConf.create({key: value for key, value in config.items_ex(resolve=False) if key != "hydra"})
@@ -61,7 +61,7 @@ def _keys(conf: Path, name: str, choices: dict[str, str | None], config: DictCon
 
 
 def _chain(path: Path) -> Iterator[Path]:
-    """A group's file after those of the same group that its defaults list names."""
+    """A group's file, preceded by the files of the same group in its defaults list."""
     if not path.is_file():
         return
     config = OmegaConf.load(path)

@@ -1,4 +1,4 @@
-"""Train a tracer on unlabelled recordings and evaluate it on held-out ones.
+"""Train a tracer on unlabelled recordings and evaluate it on validation recordings.
 
 python -m experiments.train
 python -m experiments.train 'data.recordings=[a.zarr,b.zarr]' 'data.validation=[c.zarr]' loop.num_steps=200

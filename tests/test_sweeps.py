@@ -234,7 +234,7 @@ def test_a_search_without_held_out_recordings_is_refused(tmp_path: Path) -> None
     storage = f"hydra.sweeper.storage=sqlite:///{tmp_path / 'optuna.db'}"
     refused = _sweep_objective(tmp_path, "hparams_search=optuna", storage, "data.recordings=[a.zarr]")
     assert refused.returncode == 1
-    assert refused.stderr.rstrip().endswith("Name held-out recordings: data.validation=[...].")
+    assert refused.stderr.rstrip().endswith("Give validation recordings: data.validation=[...].")
     assert not (tmp_path / "sweep").exists()
 
 
