@@ -422,7 +422,7 @@ def test_wandb_out_of_reach_or_lost_ends_no_run(tmp_path: Path, monkeypatch: pyt
     cv2.imwrite(str(picture), np.full((8, 8, 3), 90, np.uint8))
     with pytest.warns(UserWarning, match="could not log the report"):
         logger.report(tmp_path / "report", {"iou": 0.25}, tracer="learned")
-    with pytest.warns(UserWarning, match="did not take the end of the run: BrokenPipeError: no service"):
+    with pytest.warns(UserWarning, match="could not log the end of the run: BrokenPipeError: no service"):
         logger.close()
     assert json.loads((tmp_path / "metrics.jsonl").read_text()) == {"step": 1, "loss": 0.5}
 
