@@ -123,6 +123,6 @@ def steadiness(seen: Seen, settings: ObjectiveSettings, key: Array) -> tuple[Flo
     return jnp.mean(1.0 - (2.0 * overlap + 1.0) / (size + 1.0)), {}  # two masks of nothing agree
 
 
-def _started(each: Float[Array, time * shape], settings: ObjectiveSettings) -> Float[Array, started * shape]:
+def _started(each: Float[Array, " time *shape"], settings: ObjectiveSettings) -> Float[Array, " started *shape"]:
     """What is said of the frames after the first ones, in which the tracer has not seen enough; of one at the least."""
     return each[min(settings.skip_frames, each.shape[0] - 1) :]
