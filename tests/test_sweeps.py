@@ -330,7 +330,7 @@ def test_whole_numbers_and_words_of_a_grid_stay_what_they_are(tmp_path: Path) ->
     config = _config(tmp_path, tracer=tracer, grid=many)
     write_sweep(tmp_path, config, [_line(point, "slow", 0.1, 10) for point in config.points()])
     assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
-    with pytest.raises(ConfigError, match="cell is 0; expected a whole number"):
+    with pytest.raises(ConfigError, match="cell is 0; expected an integer"):
         run_sweep(_config(tmp_path, grid={"cell": (0,)}), tmp_path / "refused")  # before anything is simulated
 
 

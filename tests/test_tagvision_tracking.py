@@ -272,7 +272,7 @@ def _damaged(drawn: Recording, part: str) -> Recording:
     [
         ("unsorted", "time goes back"),
         ("phase", "1 of .* values of phase_rad are not finite"),
-        ("size", "colour is uint8 of shape .* as times and intrinsics say"),
+        ("size", "colour is uint8 of shape .* from times and intrinsics"),
         ("grey", "height, width, RGB"),
         ("floats", "colour is float32"),
         ("antenna", "expected finite"),

@@ -146,7 +146,7 @@ def test_what_is_no_folder_of_tracks_is_refused(folder, tmp_path):
     with pytest.raises(RecordingError, match=r"line 1.*Expected id, time"):
         load_scenes(TracksConfig(str(tmp_path)))
     (tmp_path / "t.csv").write_text(";time;id;x\n")
-    with pytest.raises(RecordingError, match="expected also y"):
+    with pytest.raises(RecordingError, match="columns y are missing"):
         load_xovis(tmp_path / "t.csv", RATE_HZ, 0.02)
     with pytest.raises(ValueError, match="at least 5 frames"):
         TracksConfig("x", windows_s=(0.1,))
@@ -350,7 +350,7 @@ def test_a_uwb_tag_s_positions_become_speeds_towards_a_place(tmp_path):
     assert found.own.correlation > 0.95 > found.found[1].correlation + 0.3
     assert [one["carrier"] for one in found.plain()["candidates"]] == [True, False]
     _lines(tmp_path / "XOVIS_UWB.csv", [";UWB_TIME;UWB_X"])
-    with pytest.raises(RecordingError, match="expected also UWB_Y, XOVIS_PERSON_ID"):
+    with pytest.raises(RecordingError, match="columns UWB_Y, XOVIS_PERSON_ID are missing"):
         load_uwb(tmp_path, RATE_HZ, 0.02)
 
 
