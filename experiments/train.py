@@ -31,9 +31,11 @@ def main(values: dict[str, Any], folder: Path) -> float | None:
     from tagjax.training.run import run_training
 
     suite, recordings_dir = values.pop("suite", None), values.pop("recordings_dir")
-    if suite is not None and not values["data"]["recordings"]:
-        values["data"]["recordings"] = suite_recordings(suite, "train", recordings_dir)
-        values["data"]["validation"] = suite_recordings(suite, "validation", recordings_dir)
+    data = values["data"]
+    given = data["recordings"] or data["validation"] or data["virtual_tag"]["tracks"] is not None
+    if suite is not None and not given:
+        data["recordings"] = suite_recordings(suite, "train", recordings_dir)
+        data["validation"] = suite_recordings(suite, "validation", recordings_dir)
     config = from_mapping(TrainConfig, values)
     keep_configuration(folder, values)
     with errors_in_one_line("train", DivergedError):

@@ -65,11 +65,11 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"data": {"clips": {"window": 1}}}, r"data\.clips: window is 1; expected at least 2"),
         ({"data": {"clips": {"max_reads": 0}}}, r"data\.clips: max_reads is 0; expected at least 1"),
         ({"data": {"clips": {"length": 6, "window": 7}}}, r"length is 6; expected at least the window's 7"),
-        ({"data": {"virtual_tag": {"seeds": [1]}}}, r"data\.virtual_tag: tracks is null, so there is no virtual tag"),
+        ({"data": {"virtual_tag": {"seeds": [1]}}}, r"data\.virtual_tag: tracks is null, so there are no virtual tags"),
         ({"data": {"virtual_tag": {"seeds": []}}}, r"data\.virtual_tag: seeds is empty; expected at least one"),
         ({"scores": {"tags_at_once": 0}}, r"scores: tags_at_once is 0; expected at least 1"),
         ({"scores": {"frames_at_once": -1}}, r"scores: frames_at_once is -1; expected at least 1"),
-        ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a share from 0 to 1"),
+        ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a value from 0 to 1"),
         ({"scores": {"frames": [9, 3]}}, r"scores: frames is \[9, 3\]; expected \[from, to\]"),
     ],
 )
@@ -120,7 +120,7 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
         build({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
 
 
-@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention_paper.TagAttentionPaper"])
+@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention.paper.TagAttentionPaper"])
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -1,4 +1,4 @@
-"""Every command line of README.md and docs/ composes: no key, group or choice in them is misspelt or gone."""
+"""Every command line of README, CONTRIBUTING and docs/ composes: no key, group or choice in them is misspelt or gone."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _COMMAND = re.compile(r"python -m experiments\.(\w+)([^`\n]*)")
 
 
 def commands_in(text: str) -> list[tuple[str, tuple[str, ...]]]:
-    """(experiment, arguments) of every command line, without comments and what the shell makes of the rest."""
+    """(experiment, arguments) of every command line, without comments and up to the first shell operator."""
     joined = re.sub(r"\\\n\s*", " ", text)
     found = []
     for name, rest in _COMMAND.findall(joined):
@@ -49,13 +49,13 @@ def commands_in(text: str) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def _documented() -> list[Any]:
-    files = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    files = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
     every = {command: path.name for path in files for command in commands_in(path.read_text())}
     return [pytest.param(*command, id=f"{path}:{' '.join(command[1])[:60]}") for command, path in every.items()]
 
 
 def _one_of(override: Override) -> str:
-    """A sweep's first value; all else as it stands."""
+    """The override with the first value of its sweep; unchanged if it is no sweep."""
     value = override.value()
     if isinstance(value, Glob):
         options = sorted(path.stem for path in (ROOT / "conf" / override.key_or_group).glob("*.yaml"))
@@ -77,12 +77,12 @@ def test_a_documented_command_composes(name: str, words: tuple[str, ...]) -> Non
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         values = OmegaConf.to_container(compose(name, [_one_of(one) for one in own]), resolve=True)
     assert isinstance(values, dict)
-    if name in SCHEMAS:  # what else is in the file is the command's own
+    if name in SCHEMAS:  # other keys are read by the command itself
         known = {field.name for field in dataclasses.fields(SCHEMAS[name])}
         from_mapping(SCHEMAS[name], {str(key): value for key, value in values.items() if key in known})
 
 
-def test_commands_are_found_with_what_follows_and_without_what_is_said_of_them() -> None:
+def test_commands_are_found_with_their_arguments_and_without_comments() -> None:
     text = "x `python -m experiments.train seed=1` and\n```\npython -m experiments.evaluate run=<a run> \\\n  'a=[b]'  # why\n"
     assert commands_in(text) == [("train", ("seed=1",)), ("evaluate", ("run=given", "a=[b]"))]
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import Any
 
 import goller_scenes as scenes
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from composed import composed
 
 from tagjax.baselines.goller import GollerSettings
 from tagjax.baselines.goller.detection import BlobSettings
@@ -109,8 +106,7 @@ def test_the_truth_in_place_of_a_faulty_sensor_restores_detection(shop, calibrat
 
 
 def test_the_configuration_lists_every_setting():
-    with initialize_config_dir(str(Path(__file__).parents[1].resolve() / "conf"), version_base="1.3"):
-        values: Any = OmegaConf.to_container(compose("goller"))
+    values = composed("goller")
     config = from_mapping(GollerExperiment, values)
     assert config.settings == GollerSettings()
     names = lambda kind: {field.name for field in dataclasses.fields(kind)}  # noqa: E731
@@ -125,14 +121,14 @@ def test_missing_recordings_are_named_before_any_is_opened(tmp_path):
 
     grid, shop = tmp_path / "grid.zarr", tmp_path / "shop_exit"
     config = GollerExperiment(grid=str(grid), scenarios=str(shop), handover=str(tmp_path / "nowhere"))
-    with pytest.raises(ValueError, match=r"benchmark=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
+    with pytest.raises(ValueError, match=r"suite=shop_grid.*no recording in train/, validation/, test/.*shop_exit"):
         run_goller(config, tmp_path, open_recording=opened)
     grid.mkdir()
     for split in ("train", "validation", "test"):
         with pytest.raises(ValueError, match=rf"shop_exit: no recording in .*{split}/"):
             run_goller(dataclasses.replace(config, handover=None), tmp_path, open_recording=opened)
         (shop / split / f"shop_exit-sp_st-{split}-0.zarr").mkdir(parents=True)
-    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate benchmark=shop_handover`"):
+    with pytest.raises(ValueError, match=r"handover=.*nowhere: .*simulate suite=shop_handover`"):
         run_goller(config, tmp_path, open_recording=opened)
     # By default the recordings beside the scenarios are used, if there are any.
     default = dataclasses.replace(config, handover=None)

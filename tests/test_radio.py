@@ -23,7 +23,7 @@ from tagjax.radio.reads import PhaseReads
 from tagjax.radio.refine import interpolation_weights
 from tagjax.radio.unwrap import remove_jump, unwrap_paper
 from tagjax.recording import TagReads
-from tagjax.tracing.motion_evidence import MIN_READS
+from tagjax.tracing.motion_evidence import MIN_READS, coherence_loss
 from tagjax.tracing.range_windows import (
     paper_windows,
     phase_reads,

@@ -330,7 +330,7 @@ def test_whole_numbers_and_words_of_a_grid_stay_what_they_are(tmp_path: Path) ->
     config = _config(tmp_path, tracer=tracer, grid=many)
     write_sweep(tmp_path, config, [_line(point, "slow", 0.1, 10) for point in config.points()])
     assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
-    with pytest.raises(ConfigError, match="cell is 0; expected a whole number"):
+    with pytest.raises(ConfigError, match="cell is 0; expected an integer"):
         run_sweep(_config(tmp_path, grid={"cell": (0,)}), tmp_path / "refused")  # before anything is simulated
 
 
@@ -430,7 +430,7 @@ def test_wandb_out_of_reach_or_lost_ends_no_run(tmp_path: Path, monkeypatch: pyt
         raise PermissionError("read-only")
 
     _wandb_that(monkeypatch, never)
-    with pytest.warns(UserWarning, match=r"does not begin: PermissionError: read-only\. Only metrics\.jsonl"):
+    with pytest.warns(UserWarning, match=r"cannot start: PermissionError: read-only\. Only metrics\.jsonl"):
         Logger(tmp_path, LoggerSettings(mode="offline")).write(2, {"loss": 0.25})
 
 

@@ -365,7 +365,7 @@ def test_only_frames_and_reads_enter(clip):
 
     `colour` is for flow networks that learn; `later` is what such a pass backwards said.
     """
-    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour", "later"} == set(
+    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour", "backward_message"} == set(
         Frame.__dataclass_fields__
     )
     assert {"log_odds", "anchor", "moved"} == set(BackwardMessage.__dataclass_fields__)

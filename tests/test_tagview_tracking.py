@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from tagjax.baselines import HostCamera, HostFrame, host_trace
 from tagjax.baselines.boxes import box_centre_px, box_iou, box_size_px, non_maximum_suppression
@@ -203,25 +204,25 @@ def test_training_lowers_the_loss_and_weights_are_read_back(tmp_path):
 
 
 def test_foreign_weights_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="no weights"):
-        load_weights(tmp_path / "missing.npz")
-    (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(ValueError, match="no weights"):
-        load_weights(tmp_path / "text.npz")
-    np.savez(tmp_path / "other.npz", a=np.ones(3))
-    with pytest.raises(ValueError, match="no weights"):
-        load_weights(tmp_path / "other.npz")
+    with pytest.raises(ValueError, match="no readable weights of a Tagview detector"):
+        load_weights(tmp_path / "missing.safetensors")
+    (tmp_path / "text.safetensors").write_text("hello")
+    with pytest.raises(ValueError, match="no readable weights of a Tagview detector"):
+        load_weights(tmp_path / "text.safetensors")
+    safetensors.numpy.save_file({"a": np.ones(3)}, tmp_path / "other.safetensors")
+    with pytest.raises(ValueError, match="but no weights of a Tagview detector"):
+        load_weights(tmp_path / "other.safetensors")
     network = BoxNetwork((4, 6, 8), 1, key=jax.random.key(0))
-    save_weights(tmp_path / "small.npz", network, {"network": {"widths": [4, 6, 9], "depth": 1}})
+    save_weights(tmp_path / "small.safetensors", network, {"network": {"widths": [4, 6, 9], "depth": 1}})
     with pytest.raises(
         ValueError, match=r"float16 of shape \(3, 3, 6, 8\); this network has floats of shape \(3, 3, 6, 9\)"
     ):
-        load_weights(tmp_path / "small.npz")
+        load_weights(tmp_path / "small.safetensors")
     broken = eqx.tree_at(lambda n: n.head.bias, network, jnp.full(20, jnp.nan))
     with pytest.raises(ValueError, match="not finite"):
-        save_weights(tmp_path / "nan.npz", broken, {"network": {"widths": [4, 6, 8], "depth": 1}})
+        save_weights(tmp_path / "nan.safetensors", broken, {"network": {"widths": [4, 6, 8], "depth": 1}})
     with pytest.raises(ValueError, match="network"):
-        save_weights(tmp_path / "bare.npz", network, {})
+        save_weights(tmp_path / "bare.safetensors", network, {})
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tagvision_scenes as scenes
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from composed import composed
 
 from tagjax.baselines.reads import hop_slope_rad_hz, range_phase_rad
 from tagjax.baselines.tagvision import TagVisionSettings
@@ -391,21 +390,16 @@ def test_settings_are_checked() -> None:
 # the experiments
 
 
-def _compose(name: str, *overrides: str) -> dict:
-    with initialize_config_dir(str((ROOT / "conf").resolve()), version_base="1.3"):
-        return OmegaConf.to_container(compose(name, list(overrides)), resolve=True)  # type: ignore[return-value]
-
-
 def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
-    values = _compose("tagvision", "benchmark=planar_tracks")
+    values = composed("tagvision", "suite=planar_tracks")
     values.pop("progress")
     config = from_mapping(TagVisionExperiment, values)
     assert config.system.match == config.matching["adapted"]
     assert config.matching["paper"] == MatchSettings()
     assert config.system.blobs == BlobSettings()
     assert config.system.tracks == TrackSettings()
-    assert from_mapping(CalibrateSettings, _compose("calibrate_camera", "pictures=here")).board == Board()
-    lines = dataclasses.replace(config, benchmark=None, num_calibrations=1, lines=config.lines[:2])
+    assert from_mapping(CalibrateSettings, composed("calibrate_camera", "pictures=here")).board == Board()
+    lines = dataclasses.replace(config, suite=None, num_calibrations=1, lines=config.lines[:2])
     metrics = run_tagvision(lines, tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == json.loads(json.dumps(metrics))
     assert set(metrics["lines"]) == {"stated", "stated with unknown offset"}
@@ -416,21 +410,21 @@ def test_configurations_fit_their_schemas(tmp_path: Path) -> None:
 
 
 def test_a_suite_of_lines_is_refused(tmp_path: Path) -> None:
-    values = _compose("tagvision", "benchmark=planar_101", f"out={tmp_path / 'recordings'}")
+    values = composed("tagvision", "suite=planar_101", f"paths.recordings_dir={tmp_path / 'recordings'}")
     values.pop("progress")
-    with pytest.raises(ConfigError, match=r"planar_101 has no pictures.*benchmark=planar_tracks"):
+    with pytest.raises(ConfigError, match=r"planar_101 has no pictures.*suite=planar_tracks"):
         run_tagvision(from_mapping(TagVisionExperiment, values), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.ci
 def test_planar_tracks_run_whole(tmp_path: Path) -> None:
-    values = _compose(
-        "tagvision", "benchmark=planar_tracks", "benchmark.duration_s=4.0", "benchmark.counts.test=1", "num_calibrations=1",
-        f"out={tmp_path / 'recordings'}",
+    values = composed(
+        "tagvision", "suite=planar_tracks", "suite.duration_s=4.0", "suite.counts.test=1", "num_calibrations=1",
+        f"paths.recordings_dir={tmp_path / 'recordings'}",
     )  # fmt: skip
-    values["benchmark"]["counts"] |= {"train": 0, "validation": 0}
-    values["benchmark"]["variants"] = [one for one in values["benchmark"]["variants"] if one["name"] == "three"]
+    values["suite"]["counts"] |= {"train": 0, "validation": 0}
+    values["suite"]["variants"] = [one for one in values["suite"]["variants"] if one["name"] == "three"]
     values.pop("progress")
     metrics = run_tagvision(from_mapping(TagVisionExperiment, values), tmp_path / "run")
     tracks = metrics["tracks"]

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import fcntl
 import itertools
 import json
 import multiprocessing
-import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 
+from ..core.files import atomic_path, write_atomic
+from ..core.settings import ConfigError
 from ..recording import RecordingError
 from ..recording.store import save_recording
 from ..recording.suite_folder import SPLITS
@@ -186,11 +186,8 @@ def make_item(item: Item, folder: Path) -> Made:
     path = item.path(folder)
     if item.suite.story == PLANAR:
         settings = {**item.suite.settings, **item.variant.settings}
-        partial = path.with_name(f".{path.name}.partial")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(partial, ignore_errors=True)
-        save_planar(planar_trials(PlanarSettings(**settings), seed=item.seed), partial)
-        os.replace(partial, path)
+        with atomic_path(path) as partial:
+            save_planar(planar_trials(PlanarSettings(**settings), seed=item.seed), partial)
         return Made(item.name, 0, time.perf_counter() - start)
     capture = dataclasses.replace(item.suite.capture, **item.variant.capture)
     recording = simulate_recording(item_scenario(item), capture, seed=item.seed, name=item.name)
@@ -202,7 +199,7 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
     """Check the suite's folder and return the recordings that are missing. Leftovers of an interrupted run are removed.
 
     The folder may hold the suite with other counts. Raises `RecordingError`, and changes nothing, where it holds something
-    else or the suite with other settings. The caller holds the lock of `exclusive_folder`.
+    else or the suite with other settings. The caller holds the suite's lock.
     """
     home = folder / suite.name
     manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
@@ -225,22 +222,10 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
         home.mkdir(parents=True)
         differs = {"counts"}
     if differs:
-        (home / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
+        write_atomic(home / MANIFEST, json.dumps(manifest, indent=1) + "\n")
     for partial in home.glob("*/.*.partial"):
         shutil.rmtree(partial, ignore_errors=True)
     return [item for item in suite.items() if not item.path(folder).exists()]
-
-
-@contextlib.contextmanager
-def exclusive_folder(suite: Suite, folder: Path) -> Iterator[None]:
-    """Wait until no other process simulates this suite into this folder, and keep others waiting meanwhile.
-
-    The operating system releases the lock of a process that ends in any way.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f".{suite.name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 def make_suite(
@@ -256,7 +241,8 @@ def make_suite(
     Each recording is determined by its seed alone, so the number of workers changes nothing in it. Several processes may
     call this at once: one simulates, the others wait and find the recordings there.
     """
-    with exclusive_folder(suite, folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / f".{suite.name}.lock"):
         missing = [item for item in prepare(suite, folder) if wanted(item)]
         return _make_items(missing, folder, workers, on_done or (lambda made: None))
 

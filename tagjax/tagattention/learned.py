@@ -10,11 +10,11 @@ import dataclasses
 import inspect
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..core.files import write_atomic
 from . import TagAttention
 
 PACKAGED = Path(__file__).parent / "weights"
@@ -74,9 +74,7 @@ def save_parameters(
         "parameters": tracer.physical(),
         "about": dict(about or {}),
     }
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(beside, path)
+    write_atomic(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def read_learned(source: str | Path, settings: Mapping[str, Any] | None = None) -> Learned:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.geometry import pixel_rays, range_to_depth
+from ..core.settings import ConfigError
 from ..flow.cache import pair_flow
 from ..radio.reads import PhaseReads, RadioWindow
 from ..recording import Recording, RecordingError, RecordingWarning

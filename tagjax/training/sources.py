@@ -27,6 +27,15 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
     Raises `RecordingError` for recordings that cannot be used or are in both lists, and `ConfigError` if there is none.
     """
     if not data.recordings:
+        if data.validation:
+            raise ConfigError(
+                f"data.validation is {', '.join(data.validation)}, but data.recordings is empty; expected both, or "
+                "neither and suite=<name>."
+            )
+        if data.virtual_tag != VirtualTagSettings():
+            raise ConfigError(
+                "data.virtual_tag is given, but data.recordings is empty; expected the recordings for the virtual tags."
+            )
         raise ConfigError(
             "data.recordings is empty; expected recordings: data.recordings=[a.zarr,...] or suite=<name>."
         )

@@ -133,6 +133,6 @@ def steadiness(
     return jnp.mean(1.0 - (2.0 * overlap + 1.0) / (size + 1.0)), {}  # two empty masks agree
 
 
-def _started(each: Float[Array, time * shape], settings: ObjectiveSettings) -> Float[Array, started * shape]:
+def _started(each: Float[Array, " time *shape"], settings: ObjectiveSettings) -> Float[Array, " started *shape"]:
     """Values of the frames after the first `skip_frames`, in which the tracer has too little evidence; at least one frame."""
     return each[min(settings.skip_frames, each.shape[0] - 1) :]
