@@ -228,14 +228,14 @@ def _moving_from(num_frames: int, begin: int) -> Recording:
     return dataclasses.replace(moving, reads=dataclasses.replace(reads, phase_rad=phase))
 
 
-def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
+def test_clips_without_measured_motion_are_left_out() -> None:
     late = _moving_from(50, 25)
     starts = range(0, 41, 10)
-    heard = measured_motion(late, starts, 10, ["tag-a", "tag-b"], [1])
-    assert heard.shape == (5, 2)
-    assert (heard[:1] < 1e-9).all()  # one that ends where they begin shares its last piece with what comes
-    assert (heard[3:] > 0.2).all()
-    np.testing.assert_array_equal(measured_motion(late, starts, 10, ["tag-b"], [1]), heard[:, 1:])
+    motion = measured_motion(late, starts, 10, ["tag-a", "tag-b"], [1])
+    assert motion.shape == (5, 2)
+    assert (motion[:1] < 1e-9).all()  # one that ends where they begin shares its last piece with what comes
+    assert (motion[3:] > 0.2).all()
+    np.testing.assert_array_equal(measured_motion(late, starts, 10, ["tag-b"], [1]), motion[:, 1:])
     assert not measured_motion(late, starts, 10, ["tag-a"], [2]).any()  # never read there
     drawn = iter(clip_dataset([late], clip_length=10, step=10, seed=0, min_motion=0.1, stride=2))
     assert {next(drawn).start for _ in range(5)} <= set(starts[1:])
@@ -243,7 +243,7 @@ def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
     assert {next(everything).start for _ in range(5)} == set(starts)
     still = _moving_from(40, 39)
     with pytest.raises(
-        RecordingError, match=r"In no clip of 10 frames is a tag heard to move by 0\.1 or more \(the most"
+        RecordingError, match=r"No clip of 10 frames has a tag whose reads show motion of 0\.1 or more \(the maximum"
     ):
         clip_dataset([still], clip_length=10, seed=0, min_motion=0.1, stride=2)
 
@@ -295,7 +295,7 @@ def test_no_motion_loses_all_coherence_and_none_less_than_nothing(share: float) 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"validation": ("held_out.zarr",)}, r"data\.validation names held_out\.zarr, but data\.recordings is empty"),
+        ({"validation": ("held_out.zarr",)}, r"data\.validation is held_out\.zarr, but data\.recordings is empty"),
         (
             {"virtual_tag": VirtualTagSettings(tracks="tracks.csv")},
             r"data\.virtual_tag is given, but data\.recordings is",
@@ -311,7 +311,7 @@ def test_a_recording_is_not_held_out_from_itself(tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     (tmp_path / "link.zarr").symlink_to(tmp_path / "a.zarr")
     for other in ("a.zarr/", "./b/../a.zarr", str(tmp_path / "a.zarr"), "link.zarr"):
-        with pytest.raises(RecordingError, match=r"a\.zarr: named both for training and for validation"):
+        with pytest.raises(RecordingError, match=r"a\.zarr: found in both data\.recordings and data\.validation"):
             training_recordings(DataSettings(recordings=("a.zarr",), validation=(other,)))
     with pytest.raises(RecordingError, match="no such folder"):
         training_recordings(DataSettings(recordings=("a.zarr",), validation=("b.zarr",)))

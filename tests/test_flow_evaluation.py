@@ -315,16 +315,16 @@ def test_materials_that_cannot_be_used_are_refused(scenes, filmed, tmp_path):
         folder_material(str(tmp_path / "nothing"))
     assert [case.source for case in folder_material(str(scenes / "moved")).cases()] == ["moved"]
     (scenes / "moved" / "frame11.png").unlink()
-    with pytest.raises(RecordingError, match=r"frame11\.png is missing or cannot be read"):
+    with pytest.raises(RecordingError, match=r"frame11\.png is missing or not a readable picture"):
         list(folder_material(str(scenes)).cases())
     write_flo(scenes / "still" / "flow10.flo", np.zeros((4, 5, 2), np.float32))
-    with pytest.raises(RecordingError, match=r"still: a flow of \(4, 5\) pixels for a picture of \(40, 64\)"):
+    with pytest.raises(RecordingError, match=r"still: found flow of \(4, 5\) pixels; expected \(40, 64\)"):
         list(folder_material(str(scenes / "still")).cases())
     with pytest.raises(RecordingError, match="no such folder"):
-        recording_material((str(tmp_path / "b.zarr"),), every=1, most=1)
+        recording_material((str(tmp_path / "b.zarr"),), every=1, max_pairs=1)
     with pytest.raises(RecordingError, match="expected a recording"):
-        sequence_material((str(tmp_path / "b.mp4"),), tmp_path, every=1, most=1)
-    twice = recording_material((str(filmed), str(filmed)), every=5, most=9)
+        sequence_material((str(tmp_path / "b.mp4"),), tmp_path, every=1, max_pairs=1)
+    twice = recording_material((str(filmed), str(filmed)), every=5, max_pairs=9)
     assert [case.source for case in twice.cases()] == ["a/b-0", "a/b-0", "a/b-1", "a/b-1"]
 
 
