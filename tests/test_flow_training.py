@@ -754,7 +754,7 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
         configured(tmp_path, data={"drawn": {"num_pairs": 0}})
     for name, value in (("height", 36), ("margin_px", 4)):
         odd = configured(tmp_path, data={"variation": {"height": 32, "width": 32, name: value}})
-        with pytest.raises(ValueError, match=f"variation.{name} is {value}; this network takes multiples of 8"):
+        with pytest.raises(ValueError, match=f"variation.{name} is {value}; this network needs multiples of 8"):
             run_flow_training(odd, tmp_path / "run")
     for border, size, told in ((6, 32, "leaves 20 pixels"), (16, 32, "leaves 0 pixels")):
         cut = {"loss": {"self_supervision": 0.3, "self_supervision_border_px": border}}
