@@ -1,4 +1,4 @@
-"""Measure the speed of the stages against named peers in the same run; the last line is the result as JSON.
+"""Measure the speed of the stages against peers in the same run; the last line is the result as JSON.
 
 python -m experiments.benchmark
 python -m experiments.benchmark 'cases=[flow]'
@@ -9,12 +9,11 @@ python -m experiments.benchmark 'cases=[gather,splat]' repeats=21
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from .command import checked, command
+from .command import checked, command, print_result
 
 
 @command
@@ -24,11 +23,13 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from tagjax.benchmarks.stages import BenchmarkSettings, run_benchmark
     from tagjax.core.machine import machine
+    from tagjax.core.results import write_json
 
-    console = Console(width=None if sys.stdout.isatty() else 140)  # a file has no width of its own
-    settings, written, timings = checked(BenchmarkSettings, values, folder), folder / "benchmark.json", []
+    console = Console(width=None if sys.stdout.isatty() else 140)  # a file has no terminal width
+    settings, timings = checked(BenchmarkSettings, values, folder), []
     table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s", "memory, MiB")
     with console.status("measuring") as status:
+        result: dict[str, Any] = {}
         for timing in run_benchmark(settings, on_case=lambda name: status.update(f"measuring {name}")):
             console.print(
                 f"{timing.what}: {timing.ours_ms:.2f} ms; {timing.peer}: {timing.peer_ms:.2f} ms", soft_wrap=True
@@ -39,9 +40,10 @@ def main(values: dict[str, Any], folder: Path) -> None:
             table.add_row(*row, first, memory)
             timings.append({**dataclasses.asdict(timing), "ratio": timing.ratio})
             # Written after each case, because a whole run takes minutes and may be stopped.
-            written.write_text(json.dumps({"machine": machine(), "timings": timings}) + "\n")
+            result = {"machine": machine(), "timings": timings}
+            write_json(folder / "benchmark.json", result)
     console.print(table)
-    print(written.read_text(), end="")
+    print_result(result)
 
 
 if __name__ == "__main__":

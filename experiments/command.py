@@ -1,4 +1,4 @@
-"""What every command shares: Hydra's configuration becomes checked settings, and errors end the command in one line."""
+"""The common part of every command: Hydra's configuration is converted to validated settings; errors end it in one line."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ OmegaConf.register_new_resolver("command_help", functools.partial(command_help, 
 
 
 def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], Any]:
-    """The entry point of a module `experiments/<name>.py`, which Hydra configures by conf/<name>.yaml.
+    """The entry point of a module `experiments/<name>.py`, configured by Hydra from conf/<name>.yaml.
 
-    `function` gets the configuration as plain values and the run folder. A number that it returns is a sweep's objective.
+    `function` receives the configuration as plain values and the run folder. A number that it returns is a sweep's objective.
     """
     name = Path(function.__code__.co_filename).stem
 
@@ -39,9 +39,9 @@ def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], Any
 
 
 def plain_values(config: DictConfig) -> dict[str, Any]:
-    """The resolved configuration as plain values, for the library knows neither Hydra nor OmegaConf.
+    """The resolved configuration as plain values, because the library depends neither on Hydra nor on OmegaConf.
 
-    Without `paths` and `num_trials`, which serve other keys of the configuration only.
+    `paths` and `num_trials`, which are only referred to by other keys, are left out.
     """
     values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(values, dict)

@@ -1,4 +1,4 @@
-"""Evaluate optical flows side by side: drawn pairs, recordings with exact flow, Middlebury's scenes, any video.
+"""Compare optical flows on synthetic pairs, recordings with exact flow, Middlebury's scenes, and videos.
 
 python -m experiments.evaluate_flow 'flows=[zero,dis,pyramid]'
 python -m experiments.evaluate_flow 'flows=[dis,outputs/train_flow/<time>/weights.safetensors]' 'recordings=[a.zarr,b.zarr]'

@@ -1,24 +1,22 @@
 """The text of `--help`: what the command does, its groups with their choices, and every key with its comment.
 
-Hydra prints it, for conf/hydra/default.yaml names it as the help's template. So overrides count: with
-`--help tracer=tagattention_paper` the keys of that tracer are shown.
+It is the help template in conf/hydra/default.yaml, so overrides have an effect: `--help tracer=tagattention_paper` shows
+the keys of that tracer.
 """
 
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-_LINE = re.compile(r"^(\s*)(?:- )?([\w.]+):(.*)$")
-_COMMENT = re.compile(r"(?:^|\s)# (.*)$")
+from .yaml_comments import key_comments, lines_with_keys
 
 
 def command_help(conf: Path, *, _root_: DictConfig) -> str:
-    """The help of the command that the composed configuration `_root_` is of; `conf` is the folder of the configuration."""
+    """The help of the command with the composed configuration `_root_`; `conf` is the folder of the configuration."""
     name = str(_root_.hydra.job.name)
     choices = {str(group): choice for group, choice in _root_.hydra.runtime.choices.items()}
     about = importlib.import_module(f"{__package__}.{name}").__doc__ or ""
@@ -32,7 +30,7 @@ def command_help(conf: Path, *, _root_: DictConfig) -> str:
             about.strip(),
             "\n".join(["Groups (group=choice; a choice is a file conf/<group>/<choice>.yaml):", *groups]),
             f"Keys (name=value, a.b=value) and their values as composed:\n{_keys(conf, name, choices, _root_)}",
-            "`--help group=choice` shows the keys of that choice; `--hydra-help` is about Hydra's own options.",
+            "`--help group=choice` shows the keys of that choice; `--hydra-help` explains Hydra's own options.",
         ]
     )
     return text.replace("$", "$$")  # Hydra takes the text as a string.Template
@@ -48,22 +46,22 @@ def _options(conf: Path, group: str) -> list[str]:
 
 
 def _keys(conf: Path, name: str, choices: dict[str, str | None], config: DictConfig) -> str:
-    comments = dict(_comments(conf / f"{name}.yaml", ""))
+    comments = dict(key_comments(conf / f"{name}.yaml", ""))
     for group, choice in choices.items():
         folder, _, package = group.partition("@")
-        # A key without a comment of its own has that of the group's default.
+        # A key without a comment gets the comment of the group's default.
         for path in [*_chain(conf / folder / "default.yaml"), *_chain(conf / folder / f"{choice}.yaml")]:
-            comments |= dict(_comments(path, package or folder.replace("/", ".")))
+            comments |= dict(key_comments(path, package or folder.replace("/", ".")))
     own = OmegaConf.create({key: value for key, value in config.items_ex(resolve=False) if key != "hydra"})
     lines = []
-    for path, line in _paths(OmegaConf.to_yaml(own).splitlines()):
+    for path, line in lines_with_keys(OmegaConf.to_yaml(own).splitlines()):
         comment = comments.get(path)
         lines.append(f"{line}  # {comment}" if comment else line)
     return "\n".join(lines)
 
 
 def _chain(path: Path) -> Iterator[Path]:
-    """A group's file after those of the same group that its defaults list names."""
+    """A group's file, preceded by the files of the same group in its defaults list."""
     if not path.is_file():
         return
     config = OmegaConf.load(path)
@@ -71,27 +69,3 @@ def _chain(path: Path) -> Iterator[Path]:
         if isinstance(one, str) and one != "_self_":
             yield from _chain(path.with_name(f"{one}.yaml"))
     yield path
-
-
-def _comments(path: Path, package: str) -> Iterator[tuple[str, str]]:
-    """(dotted path, comment) of every key of a file that has a comment on its own line."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    prefix = "" if any(line.startswith("# @package _global_") for line in lines) or not package else f"{package}."
-    for key, line in _paths(lines):
-        found = _COMMENT.search(line)
-        if key and found:
-            yield prefix + key, found[1]
-
-
-def _paths(lines: list[str]) -> Iterator[tuple[str, str]]:
-    """Every line of a YAML text with the dotted path of its key; an empty path for lines without a key."""
-    open_keys: list[tuple[int, str]] = []
-    for line in lines:
-        found = _LINE.match(line)
-        if found is None or line.lstrip().startswith(("#", "- ")):
-            yield "", line
-            continue
-        indent = len(found[1])
-        open_keys = [(depth, key) for depth, key in open_keys if depth < indent]
-        open_keys.append((indent, found[2]))
-        yield ".".join(key for _, key in open_keys), line

@@ -1,4 +1,4 @@
-"""What a hyper-parameter search needs of a command: the trials that are left, and the score of a run."""
+"""For a hyper-parameter search: the number of remaining trials, and the score of a run."""
 
 from __future__ import annotations
 
@@ -13,48 +13,48 @@ from .run_folder import checkpoint_steps
 
 
 def trials_left(
-    wanted: int, storage: str, study: str, folder: str, launched: str = "", *, _root_: DictConfig | None = None
+    num_trials: int, storage: str, study: str, folder: str, launched: str = "", *, _root_: DictConfig | None = None
 ) -> int:
-    """The number of trials that an Optuna study still lacks: a killed search does these when it is started again.
+    """The number of remaining trials of an Optuna study, which a killed search runs when it is started again.
 
-    Only finished trials count; a killed one stays in the study as running and is not repeated. `folder` is the sweep's: it
-    is made where no trial is left, because Hydra writes the best trial there. `launched` is the time of the launch: because
-    it is resolved here first, the folders of all jobs get the same time. Ends the command if the trials would have no score, which is so
-    where training recordings are given and held-out ones are not.
+    Only finished trials count; a killed trial stays in the study as running and is not repeated. `folder` is the sweep's
+    folder: it is created if no trial is left, because Hydra writes the best trial there. `launched` is the time of the
+    launch: because it is resolved here first, the folders of all jobs get the same time. Ends the command if the trials
+    would have no score, that is with training recordings but no validation recordings.
     """
     import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
 
     del launched
     if _root_ is not None and _without_score(_root_):
         raise SystemExit(
-            "hparams_search: data.recordings is given and data.validation is empty, so no trial would have a score. Name "
-            "held-out recordings: data.validation=[...]."
+            "hparams_search: data.recordings is given and data.validation is empty, so no trial would have a score. Give "
+            "validation recordings: data.validation=[...]."
         )
     optuna.logging.set_verbosity(logging.WARNING)
     if storage.startswith("sqlite:///"):
         Path(storage.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
     known = {one.study_name for one in optuna.get_all_study_summaries(storage)}
     if study not in known:
-        return wanted
+        return num_trials
     trials = optuna.load_study(study_name=study, storage=storage).trials
-    left = max(0, wanted - sum(trial.state is optuna.trial.TrialState.COMPLETE for trial in trials))
+    left = max(0, num_trials - sum(trial.state is optuna.trial.TrialState.COMPLETE for trial in trials))
     if not left:
         Path(folder).mkdir(parents=True, exist_ok=True)
     return left
 
 
 def _without_score(config: DictConfig) -> bool:
-    given, held_out = (OmegaConf.select(config, f"data.{name}") for name in ("recordings", "validation"))
+    training, validation = (OmegaConf.select(config, f"data.{name}") for name in ("recordings", "validation"))
     overrides = OmegaConf.select(config, "hydra.overrides.task") or ()
     swept = [*overrides, *(OmegaConf.select(config, "hydra.sweeper.params") or ())]
-    return bool(given) and not held_out and not any("data.validation" in one for one in swept)
+    return bool(training) and not validation and not any("data.validation" in one for one in swept)
 
 
 def sweep_score(score: float, folder: Path, num_steps: int) -> float | None:
     """The number that a training run returns to its sweep: None for NaN, which marks the trial as failed.
 
     NaN itself would end an Optuna sweep. Raises `KeyboardInterrupt` in a sweep if the run was stopped before its last step:
-    that is no failure, and the jobs after it must not start. The run's checkpoint is then written.
+    that is no failure, and later jobs must not start. The run's checkpoint has been written.
     """
     steps = checkpoint_steps(folder)
     if math.isnan(score) and sweeping() and steps and max(steps) < num_steps:

@@ -1,4 +1,4 @@
-"""The bar of a command that counts what it has done."""
+"""A progress bar with a count."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 def counting_bar(console: Console, *, shown: bool) -> Progress:
-    """What is being done, how much of it, for how long, and how long it will take; nothing unless `shown`."""
+    """A bar with a description, the count, and the elapsed and remaining time; hidden unless `shown`."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

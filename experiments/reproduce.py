@@ -1,4 +1,4 @@
-"""Make a table of results from its recipe: measure it, write it as JSON and into the pages that show it.
+"""Make a table of results from its recipe: measure it, write it as JSON and into its pages.
 
 python -m experiments.reproduce table=handheld               # interrupted, it resumes when it is started again
 python -m experiments.reproduce table=handheld render=true   # the Markdown again, from the JSON
@@ -43,7 +43,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     if not (ROOT / "docs").is_dir():
         raise ValueError(
-            f"found no folder docs in {ROOT}; expected a clone of the repository, whose pages are written."
+            f"found no folder docs in {ROOT}; expected a clone of the repository, whose pages can be written."
         )
     chosen, console = values.get("table"), Console(soft_wrap=True, highlight=False, markup=False)
     recipes = [from_mapping(Recipe, one, where="table") for one in ([chosen] if chosen else recipe_settings())]

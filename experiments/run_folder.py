@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-_FREE = (
+from tagjax.core.files import atomic_path
+
+_MAY_DIFFER = (
     "loop",
     "logger",
     "distributed",
@@ -20,8 +21,8 @@ _FREE = (
     "baseline_estimators",
     "matmul_precision",
 )
-_FREE_ENDS = ("workers", "decay_steps")  # the latter follows loop.num_steps
-_RETUNED = ("clip_norm", "optimizer", "joint.clip_norm", "joint.optimizer")
+_MAY_DIFFER_SUFFIXES = ("workers", "decay_steps")  # decay_steps follows loop.num_steps
+_RETUNABLE = ("clip_norm", "optimizer", "joint.clip_norm", "joint.optimizer")
 
 
 def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
@@ -29,23 +30,22 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
 
     A resumed run may have another length, logger, scores and processes. With `retune` it may also have other numbers of the
     optimiser, but no other kind, because its state would have another shape. Raises `ValueError`, naming the differences,
-    where anything else differs, and leaves the file unchanged. With `resume=false` it also leaves it unchanged: the run
-    itself then refuses to start over a checkpoint.
+    where anything else differs, and leaves the file unchanged. With `resume=false` the file is left unchanged as well: the
+    run itself then refuses to overwrite a checkpoint.
     """
     path = folder / "config.yaml"
     if checkpoint_steps(folder) and path.is_file():
         if not values.get("resume", True):
             return
         before = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-        differ = _differences(before, dict(values), retune=bool(values.get("retune", False)))
-        if differ:
+        differences = _differences(before, dict(values), retune=bool(values.get("retune", False)))
+        if differences:
             raise ValueError(
-                f"{folder} holds a run with another configuration: {'; '.join(differ)}. Give the same settings to resume it "
+                f"{folder} holds a run with another configuration: {'; '.join(differences)}. Give the same settings to resume it "
                 "(retune=true allows another clip_norm and other numbers of the optimiser), or another folder."
             )
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    OmegaConf.save(OmegaConf.create(dict(values)), beside)
-    os.replace(beside, path)
+    with atomic_path(path) as partial:
+        OmegaConf.save(OmegaConf.create(dict(values)), partial)
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
@@ -54,9 +54,9 @@ def checkpoint_steps(folder: Path) -> list[int]:
 
 
 def _differences(before: Any, now: Any, where: str = "", *, retune: bool) -> list[str]:
-    if where in _FREE or where.rpartition(".")[2] in _FREE_ENDS:
+    if where in _MAY_DIFFER or where.rpartition(".")[2] in _MAY_DIFFER_SUFFIXES:
         return []
-    retuned = retune and any(where == name or where.startswith(f"{name}.") for name in _RETUNED)
+    retuned = retune and any(where == name or where.startswith(f"{name}.") for name in _RETUNABLE)
     if retuned and all(isinstance(value, int | float) for value in (before, now)):
         return []
     if isinstance(before, dict) and isinstance(now, dict):

@@ -48,8 +48,8 @@ def main(values: dict[str, Any], folder: Path) -> None:
     frames, elapsed_s = sum(one.num_frames for one in made), sum(one.elapsed_s for one in made)
     speed = f", {frames / elapsed_s:.1f} frames/s a process" if frames else ""
     sheet = save_sheet(suite, recordings_dir)
-    kept = len(items) - len(made)
-    console.print(f"{suite.name}: {len(made)} made, {kept} kept, in {recordings_dir}{speed}; {sheet.name}")
+    num_kept = len(items) - len(made)
+    console.print(f"{suite.name}: {len(made)} made, {num_kept} kept, in {recordings_dir}{speed}; {sheet.name}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Suites by name: the files of conf/suite, and the recordings that are simulated from them."""
+"""Suites by name: the files of conf/suite, and their simulated recordings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .command import CONF
 
 
 def suites_named(names: Sequence[str]) -> dict[str, Any]:
-    """The settings of suites by name. Raises `ValueError` for a name that is no file of conf/suite."""
+    """The settings of suites by name. Raises `ValueError` for a name without a file in conf/suite."""
     known = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"suites: found {', '.join(unknown)}; expected some of {', '.join(known)}.")
@@ -31,7 +31,7 @@ def suite_recordings(
 ) -> list[str]:
     """Paths of a suite's recordings of one split, simulated where they are missing.
 
-    `max_recordings` limits those of each variant. Raises `ValueError` where the suite has none in this split.
+    `max_recordings` limits those of each variant. Raises `ValueError` if the suite has none in this split.
     """
     from tagjax.core.settings import from_mapping
     from tagjax.sim.suites import Suite, make_items

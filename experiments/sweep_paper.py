@@ -1,7 +1,7 @@
 """TagAttention's Fig. 17, and any other grid of a tracer's parameters over suites.
 
 python -m experiments.sweep_paper                                      # v0 0.01, 0.1, 0.5 m/s, slow and fast
-python -m experiments.sweep_paper width=256 clips.stride=2 max_recordings=2 paths.recordings_dir=recordings/small hydra.run.dir=outputs/sweep_small   # in small
+python -m experiments.sweep_paper width=256 clips.stride=2 max_recordings=2 paths.recordings_dir=recordings/small hydra.run.dir=outputs/sweep_small   # a small version
 python -m experiments.sweep_paper 'suites=[single_static,single_dynamic]' 'splits=[train,validation]' \\
     '+grid={alpha_m2:[1e-4,5e-4,5e-3],beta:[0.2,0.8],v0_m_s:[0.05,0.1,0.2]}' hydra.run.dir=outputs/grid
 

@@ -1,11 +1,11 @@
-"""Which of several real tracks carries a tag, virtual or real: accuracy of every method's association score by window length.
+"""Association of real tracks with virtual and real tags: accuracy of every method's score by window length.
 
 python -m experiments.tracks folder=<folder with kinect-rfid/ and xovis-uwb/>
 python -m experiments.tracks folder=<...> 'windows_s=[2,4]' max_windows=10 noise_m=0.05
 
 Of kinect-rfid/ the files <date>.txt (skeletons) and RFID_<date>.txt (the reader's speeds) are read, of xovis-uwb/ the files
-raw_xovis.csv (stereo tracks) and XOVIS_UWB.csv (positions of a UWB tag and the person that carries it); one of the two
-folders suffices. One virtual tag is put on each track, and the real tags are scored as well: tables.md, real_tags.png and
+raw_xovis.csv (stereo tracks) and XOVIS_UWB.csv (positions of a UWB tag and its carrier); one of the two folders
+suffices. One virtual tag is put on each track, and the real tags are scored as well: tables.md, real_tags.png and
 metrics.json in the run folder.
 """
 

@@ -1,4 +1,4 @@
-"""Train a tracer on unlabelled recordings and evaluate it on held-out ones.
+"""Train a tracer on unlabelled recordings and evaluate it on validation recordings.
 
 python -m experiments.train
 python -m experiments.train 'data.recordings=[a.zarr,b.zarr]' 'data.validation=[c.zarr]' loop.num_steps=200
@@ -32,8 +32,8 @@ def main(values: dict[str, Any], folder: Path) -> float | None:
 
     suite, recordings_dir = values.pop("suite", None), values.pop("recordings_dir")
     data = values["data"]
-    named = data["recordings"] or data["validation"] or data["virtual_tag"]["tracks"] is not None
-    if suite is not None and not named:
+    given = data["recordings"] or data["validation"] or data["virtual_tag"]["tracks"] is not None
+    if suite is not None and not given:
         data["recordings"] = suite_recordings(suite, "train", recordings_dir)
         data["validation"] = suite_recordings(suite, "validation", recordings_dir)
     config = from_mapping(TrainConfig, values)

@@ -19,7 +19,7 @@ from tagjax.recording import Recording, RecordingError, RecordingWarning, TagRea
 from tagjax.recording.loading import VirtualTagSettings
 from tagjax.recording.reads import join_reads
 from tagjax.tracing.clips import ClipSettings, choose_antennas, load_clip
-from tagjax.training.clip_dataset import clip_dataset, motion_heard
+from tagjax.training.clip_dataset import clip_dataset, measured_motion
 from tagjax.training.sources import DataSettings, training_recordings
 
 ANTENNAS_M = np.array([[0.0, 0.0, 0.0], [0.5, -0.3, 4.0], [9.0, 9.0, 9.0]])
@@ -231,12 +231,12 @@ def _moving_from(num_frames: int, begin: int) -> Recording:
 def test_clips_in_which_nothing_is_heard_to_move_are_not_drawn() -> None:
     late = _moving_from(50, 25)
     starts = range(0, 41, 10)
-    heard = motion_heard(late, starts, 10, ["tag-a", "tag-b"], [1])
+    heard = measured_motion(late, starts, 10, ["tag-a", "tag-b"], [1])
     assert heard.shape == (5, 2)
     assert (heard[:1] < 1e-9).all()  # one that ends where they begin shares its last piece with what comes
     assert (heard[3:] > 0.2).all()
-    np.testing.assert_array_equal(motion_heard(late, starts, 10, ["tag-b"], [1]), heard[:, 1:])
-    assert not motion_heard(late, starts, 10, ["tag-a"], [2]).any()  # never read there
+    np.testing.assert_array_equal(measured_motion(late, starts, 10, ["tag-b"], [1]), heard[:, 1:])
+    assert not measured_motion(late, starts, 10, ["tag-a"], [2]).any()  # never read there
     drawn = iter(clip_dataset([late], clip_length=10, step=10, seed=0, min_motion=0.1, stride=2))
     assert {next(drawn).start for _ in range(5)} <= set(starts[1:])
     everything = iter(clip_dataset([late], clip_length=10, step=10, seed=0, stride=2))

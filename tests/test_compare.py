@@ -25,8 +25,8 @@ from tagjax.baselines.goller.location import make_location
 from tagjax.baselines.goller.matching import make_association
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import NAMES, Cell, CompareConfig, Systems, console_table, markdown, run_comparison
-from tagjax.evaluation.compare._run import _score, _Tally
-from tagjax.evaluation.compare._table import bars, write_csv
+from tagjax.evaluation.compare.run import _score, _Tally
+from tagjax.evaluation.compare.table import bars, write_cells
 from tagjax.report.comparison import bar_plot
 from tagjax.sim.suites import Item, Suite, Variant
 from tagjax.tracing.tracer import Trace
@@ -56,7 +56,7 @@ def _printed(table: Table) -> str:
     return console.file.getvalue()
 
 
-def test_the_table_says_figures_reasons_and_what_the_papers_say():
+def test_the_table_holds_values_reasons_and_results_of_the_papers():
     table, legend = markdown(CELLS).split("\n\n", maxsplit=1)
     lines = table.splitlines()
     assert len({line.count("|") for line in lines}) == 1
@@ -64,18 +64,18 @@ def test_the_table_says_figures_reasons_and_what_the_papers_say():
     assert "does not apply: the camera looks along the room" in lines[3]
     assert lines[3].endswith("| 0.97 of theirs |")
     assert " 0.250 " in lines[4]
-    assert "P_D: share of those frames with any claim" in legend
+    assert "P_D: fraction of those frames with a detection" in legend
     assert "|" not in legend
     table = console_table(CELLS)
     assert table.row_count == 3
-    said = _printed(table)
-    assert "(1) does not apply: the camera" in said
-    assert "tagview's own paper, a: 0.97 of theirs" in said
-    assert "tagattention (people): a" in said
+    text = _printed(table)
+    assert "(1) does not apply: the camera" in text
+    assert "tagview, result of its paper, a: 0.97 of theirs" in text
+    assert "tagattention (people): a" in text
 
 
-def test_no_name_or_figure_is_cut_on_eighty_columns():
-    """Of the longest suites and systems there are, with the widest figures that are to be expected."""
+def test_no_name_or_value_is_cut_on_eighty_columns():
+    """For all suites and systems, with the widest values that can be expected."""
     cells = [
         Cell(path.stem, system, 12, 1234, 0.912, 0.934, 123.4, 1234.5, 0.956, 0.978, 1234.5, settings="handheld")
         for path in (CONF / "suite").glob("*.yaml")
@@ -88,22 +88,22 @@ def test_no_name_or_figure_is_cut_on_eighty_columns():
         assert [cell.suite, cell.system, "0.912", "0.934", "123", "1234", "0.956", "0.978", "1234"] in rows
 
 
-def test_each_papers_figures_stand_with_its_own_system():
+def test_results_of_papers_belong_to_their_own_system():
     papers = _config(["occlusion"]).published
     assert set(papers) <= {path.stem for path in (CONF / "suite").glob("*.yaml")}
-    assert {suite: list(of) for suite, of in papers.items()} == {
+    assert {suite: list(systems) for suite, systems in papers.items()} == {
         "planar_tracks": ["tagvision"],
         **{f"ceiling_{count}": ["tagview"] for count in range(2, 7)},
         "separated_traces": ["tagview"],
         "half_wavelength": ["tagview"],
         "shop_exit": ["goller"],
     }
-    with pytest.raises(ConfigError, match=r"published: unknown systems blob; expected some of tagattention, .*goller"):
+    with pytest.raises(ConfigError, match=r"published: found blob; expected some of tagattention, .*goller"):
         _config(["occlusion"], published={"occlusion": {"blob": "0.9"}})
 
 
 def test_the_csv_holds_every_field(tmp_path: Path):
-    write_csv(tmp_path / "t.csv", CELLS)
+    write_cells(tmp_path / "t.csv", CELLS)
     rows = list(csv.DictReader((tmp_path / "t.csv").read_text().splitlines()))
     assert [row["system"] for row in rows] == ["tagattention", "tagview", "tagattention"]
     assert float(rows[0]["iou"]) == 0.61
@@ -112,54 +112,54 @@ def test_the_csv_holds_every_field(tmp_path: Path):
     assert [row["paper"] for row in rows] == ["", "0.97 of theirs", ""]
 
 
-def test_bars_are_drawn_where_there_are_figures(tmp_path: Path):
+def test_bars_are_drawn_where_there_are_values(tmp_path: Path):
     assert bars(CELLS, "iou") == {"tagattention": {"a": 0.61, "b": None}, "tagview": {"a": None}}
     bar_plot(tmp_path / "c.png", {"identification": bars(CELLS, "identification"), "box IoU": bars(CELLS, "iou")})
     assert (tmp_path / "c.png").stat().st_size > 5000
 
 
-def test_false_alarms_are_claims_of_tags_that_lie_still_labelled_or_not(monkeypatch: pytest.MonkeyPatch):
-    """One is moved, one lies on a shelf and is no labelled object, one is carried out of sight: neither seen nor still."""
+def test_false_alarms_are_detections_of_stationary_tags_labelled_or_not(monkeypatch: pytest.MonkeyPatch):
+    """Two tags move with labelled objects, one is stationary without a label, and one moves out of sight."""
     drawn, num = synthetic.recording(12), 12
     assert drawn.truth is not None
     names = [*synthetic.EPCS, "shelf", "hidden"]
     epc = np.where(np.arange(len(drawn.reads.epc)) % 7 == 0, "shelf", drawn.reads.epc)
     reads = dataclasses.replace(drawn.reads, epc=np.where(np.arange(len(epc)) % 7 == 1, "hidden", epc))
     going = np.stack([np.linspace(0, 1, num), np.zeros(num), np.full(num, 2.0)], axis=-1)
-    resting = np.broadcast_to(going[:1], going.shape).copy()
-    resting[3] = np.nan  # not known at a frame
+    stationary = np.broadcast_to(going[:1], going.shape).copy()
+    stationary[3] = np.nan  # not known at a frame
     truth = dataclasses.replace(
-        drawn.truth, tag_position_m={"tag-a": going, "tag-b": going, "shelf": resting, "hidden": going}
+        drawn.truth, tag_position_m={"tag-a": going, "tag-b": going, "shelf": stationary, "hidden": going}
     )
     recording = dataclasses.replace(drawn.with_reads(reads), truth=truth)
     order = recording.resolve_epcs(None)
     assert sorted(order) == sorted(names)
 
-    def said(number: int) -> Trace:
-        claimed = {"tag-a": True, "tag-b": False, "shelf": number in (3, 4, 9), "hidden": True}
+    def trace_of(number: int) -> Trace:
+        detected = {"tag-a": True, "tag-b": False, "shelf": number in (3, 4, 9), "hidden": True}
         return Trace(
             mask=jnp.zeros((4, synthetic.HEIGHT, synthetic.WIDTH)),
             box_px=jnp.zeros((4, 4)),
             centre_px=jnp.zeros((4, 2)),
             centre_m=jnp.zeros((4, 3)),
             step_m=jnp.zeros((4, 1)),
-            confidence=jnp.full(4, 0.45),  # a claim counts alike in P_D and P_FA, whatever it is worth
-            detected=jnp.array([claimed[one] for one in order]),
+            confidence=jnp.full(4, 0.45),  # P_D and P_FA count every detection, whatever its confidence
+            detected=jnp.array([detected[one] for one in order]),
         )
 
     config = _config(["occlusion"])
-    monkeypatch.setattr(Systems, "traces", lambda *_: iter([(number, said(number)) for number in range(num)]))
+    monkeypatch.setattr(Systems, "traces", lambda *_: iter([(number, trace_of(number)) for number in range(num)]))
     monkeypatch.setattr(Systems, "stride", lambda *_: 1)
     systems, tally = Systems(config.systems, config.scores), _Tally()
     item = Item(from_mapping(Suite, config.suites["occlusion"]), Variant("all"), "test", 0, 1)
     scores = dataclasses.replace(config.scores, moved_for_s=0.0, min_pixels=2)
     _score(systems, "tagview", item, recording, scores, tally)
-    assert np.mean(np.concatenate(tally.still)) == pytest.approx(3 / num)
+    assert np.mean(np.concatenate(tally.false_alarms)) == pytest.approx(3 / num)
     assert tally.scores.result()["false_detections"] == pytest.approx((3 + num) / (2 * num))
 
 
 def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """In place of the grid's, whose widths are as they start; a file that is none is refused before anything is made."""
+    """It replaces the grid's calibration with unfitted widths; another file is refused before anything is simulated."""
     num = 3
     antennas = AntennaModel(jnp.zeros((num, 2)), jnp.zeros((num, 2)), jnp.zeros(num), jnp.zeros(num), jnp.zeros(()))
     location, association = make_location(antennas), make_association(speed_m_s=0.123)
@@ -172,8 +172,8 @@ def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPa
     found = systems._goller(recording).calibration
     np.testing.assert_allclose(found.association.log_speed_m_s, np.log(0.123), rtol=1e-5)
     item = Item(from_mapping(Suite, config.suites["shop_exit"]), Variant("all"), "test", 0, 1)
-    assert systems.taken("goller", item) == "fitted widths"
-    assert Systems(config.systems, config.scores).taken("goller", item) == "starting widths"
+    assert systems.settings_label("goller", item) == "fitted widths"
+    assert Systems(config.systems, config.scores).settings_label("goller", item) == "starting widths"
     wrong = dataclasses.replace(settings, goller_calibration=str(tmp_path / "none.json"))
     with pytest.raises(ConfigError, match=r"systems\.goller_calibration: .*none\.json.*experiments\.goller"):
         run_comparison(
@@ -188,12 +188,12 @@ def test_what_cannot_be_compared_is_refused():
     assert list(suites_named(["occlusion"])) == ["occlusion"]
     with pytest.raises(ConfigError, match="suites is empty"):
         _config([])
-    for change, told in (
+    for change, message in (
         ({"only": ("magic",)}, "magic"),
         ({"split": "exam"}, "exam"),
         ({"max_recordings": 0}, "max_recordings"),
     ):
-        with pytest.raises(ConfigError, match=told):
+        with pytest.raises(ConfigError, match=message):
             _config(["occlusion"], **change)
 
 
@@ -203,8 +203,8 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
         ["planar_tracks"], smoke=True, max_recordings=1, recordings_dir=str(tmp_path / "made"), only=("tagattention_paper", "tagvision", "goller")
     )  # fmt: skip
     config = dataclasses.replace(config, scores=dataclasses.replace(config.scores, moved_for_s=0.2, min_pixels=2))
-    told: list[str] = []
-    cells = run_comparison(config, tmp_path / "out", on_progress=told.append)
+    reported: list[str] = []
+    cells = run_comparison(config, tmp_path / "out", on_progress=reported.append)
     paper, vision, goller = cells
     assert goller.reason == "location by proximity needs several antennas"
     assert (paper.num_recordings, vision.num_recordings) == (2, 2)  # one of each variant
@@ -219,12 +219,12 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     assert [one["paper"] for one in written] == [None, config.published["planar_tracks"]["tagvision"], None]
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()
-    assert any("simulated" in line for line in told)
+    assert any("simulated" in line for line in reported)
     assert (paper.settings, vision.settings) == ("people", None)
-    assert (vision.error_mm is None) == (vision.identification == 0)  # an error is of what is named rightly
+    assert (vision.error_mm is None) == (vision.identification == 0)  # the error is over correctly identified frames
 
 
-def test_a_suite_without_pictures_is_said_to_be_one_and_the_others_go_on(tmp_path: Path):
+def test_a_suite_without_pictures_is_skipped_with_a_reason(tmp_path: Path):
     config = _config(
         ["planar_101", "planar_tracks"],
         smoke=True,

@@ -25,7 +25,7 @@ from tagjax.training.config import TrainConfig
 from tagjax.training.flow_sources import FlowDataSettings
 from tagjax.training.logging import LoggerSettings
 from tagjax.training.loop import LoopSettings
-from tagjax.training.loss import ObjectiveSettings
+from tagjax.training.objective import ObjectiveSettings
 from tagjax.training.processes import DistributedSettings
 from tagjax.training.sources import DataSettings
 

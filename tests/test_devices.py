@@ -11,8 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tagjax.training.devices import check_batch, copied, local, spread
-from tagjax.training.processes import DistributedSettings, any_process, arrays_of_first, mean_over_processes, share_of
+from tagjax.training.devices import check_batch, replicate, shard, unreplicate
+from tagjax.training.processes import (
+    DistributedSettings,
+    any_process,
+    broadcast_arrays,
+    local_batch_size,
+    mean_over_processes,
+)
 
 FLOW_STEPS = """
 import json
@@ -46,7 +52,7 @@ import json
 import jax, numpy as np, optax
 import synthetic_clips as synthetic
 from tagjax.training import step as training_step
-from tagjax.training.loss import ObjectiveSettings
+from tagjax.training.objective import ObjectiveSettings
 from tagjax.training.state import TrainState
 from tagjax.training.step import make_optimizer, train_step
 
@@ -107,9 +113,9 @@ def test_eight_devices_learn_tracing_as_one_does():
 def test_one_device_leaves_everything_where_it_is():
     batch = np.zeros((3, 2))
     check_batch(3)
-    for leave in (spread, copied, local, mean_over_processes, arrays_of_first):
+    for leave in (shard, replicate, unreplicate, mean_over_processes, broadcast_arrays):
         assert leave(batch) is batch
-    assert share_of(3) == 3
+    assert local_batch_size(3) == 3
     assert any_process(True)
     assert not any_process(False)
 
@@ -119,7 +125,7 @@ def test_one_device_leaves_everything_where_it_is():
     [
         ({"num_processes": 2}, "num_processes is 2 without a coordinator"),
         ({"num_processes": 2, "process_id": 2, "coordinator": "a:1"}, "process_id is 2; expected 0 to 1"),
-        ({"num_processes": 0}, "num_processes 0; at least 1"),
+        ({"num_processes": 0}, "num_processes 0; expected at least 1"),
         ({"timeout_s": 0}, "timeout_s is 0"),
     ],
 )
@@ -130,8 +136,8 @@ def test_processes_that_cannot_meet_are_refused(settings: dict, message: str):
 
 def test_a_scheduler_that_is_not_there_is_named():
     code = (
-        "from tagjax.training.processes import DistributedSettings, joined\n"
-        "with joined(DistributedSettings(automatic=True, timeout_s=5)): pass"
+        "from tagjax.training.processes import DistributedSettings, distributed_runtime\n"
+        "with distributed_runtime(DistributedSettings(automatic=True, timeout_s=5)): pass"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1

@@ -311,7 +311,7 @@ def test_drawn_pairs_are_the_same_however_many_are_asked_for():
 
 
 def test_materials_that_cannot_be_used_are_refused(scenes, filmed, tmp_path):
-    with pytest.raises(RecordingError, match=r"no frame10\.png, here or in folders within"):
+    with pytest.raises(RecordingError, match=r"no frame10\.png, here or in its subfolders"):
         folder_material(str(tmp_path / "nothing"))
     assert [case.source for case in folder_material(str(scenes / "moved")).cases()] == ["moved"]
     (scenes / "moved" / "frame11.png").unlink()
@@ -331,7 +331,7 @@ def test_materials_that_cannot_be_used_are_refused(scenes, filmed, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"flows": ()}, "No flow is named"),
+        ({"flows": ()}, "flows is empty"),
         ({"num_pairs": 0}, "Nothing to evaluate on"),
         ({"every": 0}, "every is 0; expected at least 1"),
         ({"num_pairs": -1, "folders": ("a",)}, "num_pairs is -1"),

@@ -32,10 +32,10 @@ from tagjax.sim.flow_pairs import FlowPair, FlowPairSettings
 from tagjax.training import flow_sources
 from tagjax.training.checkpoint import Checkpoints
 from tagjax.training.flow_config import TrainFlowConfig
-from tagjax.training.flow_run import flow_of, flow_of_peer, run_flow_training, scores
+from tagjax.training.flow_run import flow_by_name, predict_flow, run_flow_training, scores
 from tagjax.training.flow_sources import DrawnSettings, drawn_pairs, flow_dataset, validation_pairs
 from tagjax.training.flow_step import FlowTrainState, batch_loss, flow_step
-from tagjax.training.flow_teacher import cut_pairs, taught_flow
+from tagjax.training.flow_teacher import cut_pairs, teacher_flow
 
 SMALL = {
     "_target_": "tagjax.flow.pyramid.PyramidFlow",
@@ -359,21 +359,21 @@ def test_a_teachers_flow_is_computed_once_and_goes_by_pairs_and_teacher(
     from tagjax.training import flow_teacher
 
     pairs = smooth_pictures(6, 40, 48).reshape(3, 2, 40, 48, 3)
-    flows = taught_flow(pairs, "dis_fast", tmp_path, progress=False)
+    flows = teacher_flow(pairs, "dis_fast", tmp_path, progress=False)
     peer = make_flow("dis_fast")
     expected = np.stack([peer(first, second) for first, second in pairs]).astype(np.float16)
     np.testing.assert_array_equal(flows[:], expected)
-    taught_flow(pairs[:2], "dis_fast", tmp_path, progress=False)
-    taught_flow(pairs, "zero", tmp_path, progress=False)
+    teacher_flow(pairs[:2], "dis_fast", tmp_path, progress=False)
+    teacher_flow(pairs, "zero", tmp_path, progress=False)
     assert len(list(tmp_path.iterdir())) == 3
 
     def never(name: str):
         raise AssertionError(name)
 
     monkeypatch.setattr(flow_teacher, "make_flow", never)
-    np.testing.assert_array_equal(taught_flow(pairs, "dis_fast", tmp_path, progress=False)[:], expected)
+    np.testing.assert_array_equal(teacher_flow(pairs, "dis_fast", tmp_path, progress=False)[:], expected)
     with pytest.raises(ValueError, match="Unknown optical flow 'nobody'"):
-        taught_flow(pairs, "nobody", tmp_path, progress=False)
+        teacher_flow(pairs, "nobody", tmp_path, progress=False)
 
 
 def test_a_teacher_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -384,7 +384,7 @@ def test_a_teacher_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(flow_teacher, "make_flow", lambda name: broken)
     with pytest.raises(KeyboardInterrupt):
-        taught_flow(smooth_pictures(4, 32, 32).reshape(2, 2, 32, 32, 3), "dis", tmp_path, progress=False)
+        teacher_flow(smooth_pictures(4, 32, 32).reshape(2, 2, 32, 32, 3), "dis", tmp_path, progress=False)
     assert not list(tmp_path.iterdir())
 
 
@@ -403,8 +403,8 @@ def test_a_teacher_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(flow_teacher, "_SHARD", 2)
     pairs = np.broadcast_to(np.arange(5, dtype=np.uint8).reshape(5, 1, 1, 1, 1), (5, 2, 32, 32, 3))
     with pytest.raises(KeyboardInterrupt):
-        taught_flow(pairs, "dis", tmp_path, progress=False)
-    flows = taught_flow(pairs, "dis", tmp_path, progress=False)
+        teacher_flow(pairs, "dis", tmp_path, progress=False)
+    flows = teacher_flow(pairs, "dis", tmp_path, progress=False)
     assert asked == [0, 1, 2, 3, 2, 3, 4]
     np.testing.assert_array_equal(flows[:, 0, 0, 0], np.arange(5))
     assert len(list(tmp_path.iterdir())) == 1
@@ -442,8 +442,8 @@ def test_a_student_learns_what_the_teacher_says() -> None:
     for _ in range(30):
         state, numbers = flow_step(state, samples, optimizer, settings, 10.0)
         told.append(numbers)
-    assert set(told[0]) == {"imitation", "loss", "gradient_norm", "skipped"}
-    assert told[0]["loss"] == told[0]["imitation"]
+    assert set(told[0]) == {"distillation", "loss", "gradient_norm", "skipped"}
+    assert told[0]["loss"] == told[0]["distillation"]
     assert told[-1]["loss"] < 0.8 * told[0]["loss"]
     assert not any(numbers["skipped"] for numbers in told)
 
@@ -621,7 +621,11 @@ def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     pictures = jnp.asarray(np.stack([sample["clean"][:, :31] for sample in batch()]), jnp.float32) / 255
     shares = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=False)[1]["occluded_fraction"])
+        float(
+            batch_loss(network, pictures, pictures, jnp.asarray(step), settings, self_supervise=False)[1][
+                "occluded_fraction"
+            ]
+        )
         for step in (4, 5)
     ]
     assert shares[0] == pytest.approx(1 / 32)  # what leaves the picture
@@ -638,7 +642,11 @@ def test_teacher_is_heard_late_and_then_ramped() -> None:
     pictures = jnp.asarray(dark * np.asarray([1.0, 0.5], np.float32).reshape(1, 2, 1, 1, 1))
     network = ShiftingNetwork(shift_px=jnp.asarray(1.0), divisor=1)
     teaching = [
-        float(batch_loss(network, pictures, pictures, jnp.asarray(step), settings, teach=True)[1]["self_supervision"])
+        float(
+            batch_loss(network, pictures, pictures, jnp.asarray(step), settings, self_supervise=True)[1][
+                "self_supervision"
+            ]
+        )
         for step in (10, 15, 20, 40)
     ]
     # Backward, the student is two pixels off in one of two axes where the teacher is sure; forward it is right.
@@ -721,10 +729,10 @@ def test_peers_and_scores_are_what_they_are_called(tmp_path: Path) -> None:
     pairs = validation_pairs(drawn(tmp_path))
     truth = np.asarray(pairs.forward_px)
     assert scores(truth, pairs)["all"] == 0.0
-    zero = scores(flow_of_peer("zero", pairs), pairs)
+    zero = scores(flow_by_name("zero", pairs), pairs)
     np.testing.assert_allclose(zero["all"], np.mean(np.linalg.norm(truth, axis=-1)), rtol=1e-5)
-    assert scores(flow_of_peer("dis", pairs), pairs)["visible"] < zero["visible"]
-    assert flow_of(small_network(), pairs).shape == truth.shape
+    assert scores(flow_by_name("dis", pairs), pairs)["visible"] < zero["visible"]
+    assert predict_flow(small_network(), pairs).shape == truth.shape
 
 
 def test_networks_are_validated_on_pairs_of_any_size() -> None:
@@ -736,7 +744,7 @@ def test_networks_are_validated_on_pairs_of_any_size() -> None:
     assert 70 % network.divisor
     assert 90 % network.divisor
     expected = [NetworkFlow(network)(first, second) for first, second in zip(firsts, seconds, strict=True)]
-    np.testing.assert_allclose(flow_of(network, pairs), expected, atol=1e-5)
+    np.testing.assert_allclose(predict_flow(network, pairs), expected, atol=1e-5)
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from tagjax.tagattention import TagAttention
 from tagjax.tracing.clips import Clip, load_clip
 from tagjax.training.config import TrainConfig
 from tagjax.training.joint import JointModel, network_flow
-from tagjax.training.loss import ObjectiveSettings
+from tagjax.training.objective import ObjectiveSettings
 from tagjax.training.run import make_model, run_training
 from tagjax.training.step import clip_gradient, clip_loss
 

@@ -27,8 +27,9 @@ from tagjax.tagattention.paper import TagAttentionPaper
 from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.training import run as run_module
 from tagjax.training.config import TrainConfig
-from tagjax.training.loop import Trained
-from tagjax.training.run import antennas_for, run_training
+from tagjax.training.evaluate import antennas_for, parameters
+from tagjax.training.loop import TrainingResult
+from tagjax.training.run import run_training
 from tagjax.training.state import TrainState
 
 ROOT = Path(__file__).parents[1]
@@ -105,8 +106,8 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
 def test_what_was_learned_is_kept_where_nothing_is_held_out(
     recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def moved(state: TrainState, *_: Any, **__: Any) -> Trained[TrainState]:
-        return Trained(eqx.tree_at(lambda one: one.model, state, learned), interrupted=False)
+    def moved(state: TrainState, *_: Any, **__: Any) -> TrainingResult[TrainState]:
+        return TrainingResult(eqx.tree_at(lambda one: one.model, state, learned), interrupted=False)
 
     values = _values(recordings)
     values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
@@ -115,7 +116,7 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
     monkeypatch.setattr(run_module, "train", moved)
     assert math.isnan(run_training(from_mapping(TrainConfig, values), tmp_path))
     kept = make_tracer(values["tracer"], str(tmp_path / "weights.json"))
-    assert run_module.parameters(kept) == pytest.approx(run_module.parameters(learned), rel=1e-6)
+    assert parameters(kept) == pytest.approx(parameters(learned), rel=1e-6)
     assert set(json.loads((tmp_path / "parameters.json").read_text())) == {"learned", "untrained", "paper"}
 
 
@@ -139,9 +140,9 @@ def test_processes_join_before_anything_asks_for_devices(
         raise Joined
 
     def too_early(*_: Any) -> Any:
-        raise AssertionError("built before the processes have joined")
+        raise AssertionError("built before the distributed runtime")
 
-    monkeypatch.setattr(run_module, "joined", joins)
+    monkeypatch.setattr(run_module, "distributed_runtime", joins)
     monkeypatch.setattr(run_module, "make_tracer", too_early)
     with pytest.raises(Joined):
         run_training(from_mapping(TrainConfig, _values(recordings)), tmp_path)
@@ -150,7 +151,7 @@ def test_processes_join_before_anything_asks_for_devices(
 def test_smoothing_that_the_tracer_cannot_do_is_refused_before_the_work(recordings: list[str], tmp_path: Path) -> None:
     values = _values(recordings)
     values["scores"]["smooth"] = True
-    with pytest.raises(ConfigError, match=r"scores\.smooth: TagAttentionPaper goes forwards only"):
+    with pytest.raises(ConfigError, match=r"scores\.smooth is true, which TagAttentionPaper does not support"):
         run_training(from_mapping(TrainConfig, values), tmp_path)
     assert not list(tmp_path.iterdir())
 
@@ -172,7 +173,7 @@ def test_a_run_may_be_scored_smoothed(recordings: list[str], tmp_path: Path) -> 
 def test_the_same_recording_cannot_be_held_out(recordings: list[str], tmp_path: Path) -> None:
     values = _values(recordings)
     values["data"]["validation"] = values["data"]["recordings"]
-    with pytest.raises(RecordingError, match="hold it out"):
+    with pytest.raises(RecordingError, match=r"found in both data\.recordings and data\.validation"):
         run_training(from_mapping(TrainConfig, values), tmp_path)
 
 

@@ -11,7 +11,7 @@ from test_joint import KEY, LOSS, _in_double, _panned, _panning_network
 from tagjax.tagattention import TagAttention
 from tagjax.tracing.clips import load_clip
 from tagjax.training.joint import JointModel
-from tagjax.training.loss import TERM_NAMES, ObjectiveSettings
+from tagjax.training.objective import TERM_NAMES, ObjectiveSettings
 from tagjax.training.step import clip_gradient, clip_loss
 
 SETTINGS = ObjectiveSettings(

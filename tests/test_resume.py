@@ -142,11 +142,11 @@ def test_a_killed_flow_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     _same(straight, broken)
 
 
-def _clips(workers: int = 0, share: tuple[int, int] = (0, 1)):
+def _clips(workers: int = 0, shard: tuple[int, int] = (0, 1)):
     held = synthetic.enlarged(synthetic.recording(12), 4)
     return iter(
         clip_dataset(
-            [held], clip_length=4, stride=4, step=1, seed=3, flow="dis_ultrafast", workers=workers, share=share
+            [held], clip_length=4, stride=4, step=1, seed=3, flow="dis_ultrafast", workers=workers, shard=shard
         )
     )
 
@@ -174,7 +174,7 @@ def test_a_scheduler_s_sigterm_leaves_workers_time_for_the_last_step() -> None:
 
 @pytest.mark.ci
 def test_shares_of_a_stream_are_the_stream_and_places_are_common() -> None:
-    whole, parts = _clips(), [_clips(share=(number, 2)) for number in range(2)]
+    whole, parts = _clips(), [_clips(shard=(number, 2)) for number in range(2)]
     starts = [next(whole).start for _ in range(8)]
     assert len(set(starts)) > 4
     assert [next(parts[place % 2]).start for place in range(8)] == starts

@@ -15,7 +15,7 @@ from tagjax.core.settings import ConfigError, changed, from_mapping
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.training.config import TrainConfig
 from tagjax.training.loop import LoopSettings
-from tagjax.training.loss import ObjectiveSettings
+from tagjax.training.objective import ObjectiveSettings
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 WORDS = st.text(max_size=8)

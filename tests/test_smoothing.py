@@ -24,7 +24,7 @@ from tagjax.tagattention.paper import TagAttentionPaper
 from tagjax.tracing.clips import Clip, ClipSettings, load_clip
 from tagjax.tracing.recordings import trace_recording
 from tagjax.tracing.tracer import BackwardMessage, Camera, Frame, Trace, trace
-from tagjax.training.run import evaluate_tracers
+from tagjax.training.evaluate import evaluate_tracers
 
 EPCS = list(synthetic.EPCS)
 NUM_FRAMES = 20
@@ -221,5 +221,5 @@ def test_who_goes_forwards_only_is_told_so(tmp_path: Path) -> None:
         "settings": settings,
         "progress": False,
     }
-    with pytest.raises(ConfigError, match=r"scores.smooth: TagAttentionPaper goes forwards only"):
+    with pytest.raises(ConfigError, match=r"scores.smooth is true, which TagAttentionPaper does not support"):
         evaluate_tracers({"paper": TagAttentionPaper()}, folder=tmp_path, **common)

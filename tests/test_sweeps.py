@@ -234,7 +234,7 @@ def test_a_search_without_held_out_recordings_is_refused(tmp_path: Path) -> None
     storage = f"hydra.sweeper.storage=sqlite:///{tmp_path / 'optuna.db'}"
     refused = _sweep_objective(tmp_path, "hparams_search=optuna", storage, "data.recordings=[a.zarr]")
     assert refused.returncode == 1
-    assert refused.stderr.rstrip().endswith("Name held-out recordings: data.validation=[...].")
+    assert refused.stderr.rstrip().endswith("Give validation recordings: data.validation=[...].")
     assert not (tmp_path / "sweep").exists()
 
 
@@ -414,15 +414,15 @@ def test_wandb_out_of_reach_or_lost_ends_no_run(tmp_path: Path, monkeypatch: pyt
     with pytest.warns(UserWarning, match=r"cannot be reached: CommError: Run init.* 90\.0 sec\. Logging offline"):
         logger = Logger(tmp_path, LoggerSettings(mode="online"))
     with pytest.warns(
-        UserWarning, match=r"did not take a step's numbers: RuntimeError: the service has gone\. The run"
+        UserWarning, match=r"could not log a step's numbers: RuntimeError: the service has gone\. The run"
     ):
         logger.write(1, {"loss": 0.5})
     picture = tmp_path / "report" / "curves" / "a.png"
     picture.parent.mkdir(parents=True)
     cv2.imwrite(str(picture), np.full((8, 8, 3), 90, np.uint8))
-    with pytest.warns(UserWarning, match="did not take the report"):
+    with pytest.warns(UserWarning, match="could not log the report"):
         logger.report(tmp_path / "report", {"iou": 0.25}, tracer="learned")
-    with pytest.warns(UserWarning, match="did not take the end of the run: BrokenPipeError: no service"):
+    with pytest.warns(UserWarning, match="could not log the end of the run: BrokenPipeError: no service"):
         logger.close()
     assert json.loads((tmp_path / "metrics.jsonl").read_text()) == {"step": 1, "loss": 0.5}
 
@@ -430,7 +430,7 @@ def test_wandb_out_of_reach_or_lost_ends_no_run(tmp_path: Path, monkeypatch: pyt
         raise PermissionError("read-only")
 
     _wandb_that(monkeypatch, never)
-    with pytest.warns(UserWarning, match=r"does not begin: PermissionError: read-only\. Only metrics\.jsonl"):
+    with pytest.warns(UserWarning, match=r"cannot start: PermissionError: read-only\. Only metrics\.jsonl"):
         Logger(tmp_path, LoggerSettings(mode="offline")).write(2, {"loss": 0.25})
 
 

@@ -14,30 +14,26 @@ import pytest
 import yaml
 
 from tagjax.core.settings import from_mapping
-from tagjax.evaluation.real_tags import (
+from tagjax.evaluation.tracks.association import METHODS, accuracy, association_scores, windows
+from tagjax.evaluation.tracks.real_tags import (
     SCORES,
     align,
     associate,
-    heard_speed,
+    measured_speed,
     places_around,
     speed_scores,
     speed_windows,
 )
-from tagjax.evaluation.tracks import (
-    METHODS,
+from tagjax.evaluation.tracks.run import run_tracks, score_real_tags
+from tagjax.evaluation.tracks.scenes import (
     Scene,
     TracksConfig,
     antenna_place,
-    association_scores,
     load_kinect,
     load_scenes,
     load_xovis,
-    real_tags_markdown,
-    right,
-    run_real_tags,
-    run_tracks,
-    windows,
 )
+from tagjax.evaluation.tracks.tables import real_tags_markdown
 from tagjax.recording import RecordingError
 from tagjax.recording.importers.tagged_walks import Speeds, Walk, load_tagged, load_uwb
 from tagjax.tagattention.attention import coherent_score
@@ -124,9 +120,9 @@ def test_windows_are_those_in_which_the_carrier_moves(folder):
 
 
 def test_ties_count_for_their_share():
-    assert right(np.array([0.2, 0.9, 0.1]), 1) == 1.0
-    assert right(np.array([0.2, 0.9, 0.1]), 0) == 0.0
-    assert right(np.zeros(4), 2) == 0.25
+    assert accuracy(np.array([0.2, 0.9, 0.1]), 1) == 1.0
+    assert accuracy(np.array([0.2, 0.9, 0.1]), 0) == 0.0
+    assert accuracy(np.zeros(4), 2) == 0.25
 
 
 def test_a_silent_tag_scores_nothing(folder):
@@ -264,7 +260,7 @@ def tagged_folder(tmp_path_factory) -> Path:
 
 def test_a_tag_s_speed_at_a_time_is_that_of_the_reads_around_it():
     speeds = Speeds(np.concatenate([np.arange(0, 4, 0.02), [9.0]]), np.concatenate([np.full(200, 0.7), [5.0]]))
-    heard = heard_speed(speeds, np.array([1.0, 2.0, 6.0, 9.0]))
+    heard = measured_speed(speeds, np.array([1.0, 2.0, 6.0, 9.0]))
     np.testing.assert_allclose(heard[:2], 0.7)
     assert np.isnan(heard[2:]).all()  # none near, and one alone
 
@@ -284,7 +280,7 @@ def test_the_antenna_and_the_clocks_come_out_of_a_tag_s_speeds(tagged_folder):
     np.testing.assert_allclose([one.lag_s for one in together], LAGS_S, atol=0.1)
     # At that place a correlation is NumPy's own over the frames that both cover.
     (given,) = align([(first.walks[0], first.speeds)], ANTENNA_M[None])
-    heard = heard_speed(first.speeds, first.walks[0].time_s - given.lag_s)
+    heard = measured_speed(first.speeds, first.walks[0].time_s - given.lag_s)
     seen = first.walks[0].towards_m_s(ANTENNA_M)
     both = np.isfinite(heard)
     assert given.correlation == pytest.approx(np.corrcoef(heard[both], seen[both])[0, 1], abs=2e-3)
@@ -297,9 +293,9 @@ def test_real_tags_are_told_by_antennas_that_other_recordings_place(tagged_folde
     found = associate(load_tagged(tagged_folder / "kinect-rfid", RATE_HZ))
     for one, lag_s in zip(found, LAGS_S, strict=True):
         assert one.carrier == 0
-        np.testing.assert_allclose(one.found[0].antenna_m, ANTENNA_M, atol=0.4)
-        assert one.found[0].lag_s == pytest.approx(lag_s, abs=0.1)
-        assert one.found[0].correlation > 0.85 > max(other.correlation for other in one.found[1:]) + 0.1
+        np.testing.assert_allclose(one.alignments[0].antenna_m, ANTENNA_M, atol=0.4)
+        assert one.alignments[0].lag_s == pytest.approx(lag_s, abs=0.1)
+        assert one.alignments[0].correlation > 0.85 > max(other.correlation for other in one.alignments[1:]) + 0.1
     assert [len(one.candidates) for one in found] == [3, 3]
     windows_4s = [window for one in found for window in speed_windows(one, 4.0, 0.16)]
     assert len(windows_4s) > 8
@@ -310,7 +306,7 @@ def test_real_tags_are_told_by_antennas_that_other_recordings_place(tagged_folde
         straight = np.corrcoef(window.distance_m[1], -np.cumsum(window.towards_m_s))[0, 1]
         assert scores["Tagview, R^2"][1] == pytest.approx(max(straight, 0.0) ** 2, abs=1e-9)
     config = TracksConfig(str(tagged_folder), windows_s=(1.0, 4.0), frame_rate_hz=RATE_HZ)
-    real = run_real_tags(config, tmp_path, lambda name: None)
+    real = score_real_tags(config, tmp_path, lambda name: None)
     short, long = real["real_tags"]
     for name in SCORES:
         assert long["accuracy"][name] >= short["accuracy"][name] - 0.05
@@ -320,7 +316,7 @@ def test_real_tags_are_told_by_antennas_that_other_recordings_place(tagged_folde
     assert "| 2-5-2020 |" in text
     assert "|  |  |  | ...99 |" in text
     assert "...70, of another recording" in text
-    assert run_real_tags(TracksConfig(str(tmp_path)), tmp_path, print) == {}
+    assert score_real_tags(TracksConfig(str(tmp_path)), tmp_path, print) == {}
     assert real_tags_markdown({}) == ""
 
 
@@ -347,7 +343,7 @@ def test_a_uwb_tag_s_positions_become_speeds_towards_a_place(tmp_path):
     (found,) = associate([tagged])
     assert found.carrier == 0
     assert found.own.lag_s == pytest.approx(-0.7, abs=0.15)
-    assert found.own.correlation > 0.95 > found.found[1].correlation + 0.3
+    assert found.own.correlation > 0.95 > found.alignments[1].correlation + 0.3
     assert [one["carrier"] for one in found.plain()["candidates"]] == [True, False]
     _lines(tmp_path / "XOVIS_UWB.csv", [";UWB_TIME;UWB_X"])
     with pytest.raises(RecordingError, match="columns UWB_Y, XOVIS_PERSON_ID are missing"):
@@ -380,10 +376,10 @@ def test_real_tags_are_carried_by_who_walks_as_they_do(real_data):
     found = associate(load_tagged(real_data / "tracks" / "kinect-rfid", RATE_HZ))
     assert [one.carrier for one in found] == [0, 0, 0]
     for one in found:
-        best, *others = sorted((each.correlation for each in one.found), reverse=True)
-        assert best == one.found[0].correlation > 0.8
+        best, *others = sorted((each.correlation for each in one.alignments), reverse=True)
+        assert best == one.alignments[0].correlation > 0.8
         assert max(others) < 0.7
-        np.testing.assert_allclose(one.found[0].antenna_m, [4.4, 0.9], atol=0.4)
+        np.testing.assert_allclose(one.alignments[0].antenna_m, [4.4, 0.9], atol=0.4)
     uwb = associate(load_uwb(real_data / "tracks" / "xovis-uwb", RATE_HZ, 0.02))
     assert [one.candidates[one.carrier].name for one in uwb] == [one.tagged.carrier for one in uwb]
-    assert all(one.found[one.carrier].correlation > 0.8 for one in uwb)
+    assert all(one.alignments[one.carrier].correlation > 0.8 for one in uwb)

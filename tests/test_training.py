@@ -24,8 +24,8 @@ from jaxtyping import Array, Int32
 from tagjax.recording import RecordingError
 from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.logging import Logger, LoggerSettings
-from tagjax.training.loop import DivergedError, LoopSettings, resumed, train
-from tagjax.training.loss import (
+from tagjax.training.loop import DivergedError, LoopSettings, resume_state, train
+from tagjax.training.objective import (
     TERM_NAMES,
     TERMS,
     ObjectiveSettings,
@@ -39,7 +39,7 @@ from tagjax.training.loss import (
     distance_at,
     future_agreement,
     objective,
-    see,
+    objective_inputs,
     steadiness,
 )
 from tagjax.training.state import TrainState
@@ -87,24 +87,24 @@ def test_distance_is_the_sum_of_steps_linear_in_between() -> None:
 
 
 def _said_with_true_steps(clip: synthetic.SyntheticClip):
-    seen = see(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
+    seen = objective_inputs(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
     time_s = np.asarray(clip.frames.time_s, np.float64)
     steps = np.stack([np.diff(synthetic.offset_m(label, time_s), prepend=0.0) for label in (1, 2)], axis=1)
-    return eqx.tree_at(lambda s: s.said.step_m, seen, jnp.asarray(steps[..., None], jnp.float32))
+    return eqx.tree_at(lambda s: s.trace.step_m, seen, jnp.asarray(steps[..., None], jnp.float32))
 
 
 def test_true_motion_explains_own_reads_and_no_others() -> None:
     seen = _said_with_true_steps(_clip())
     found = eqx.filter_jit(agreement)(seen, SETTINGS, KEY)
-    own = np.asarray(jnp.einsum("iip->ip", found.between))
+    own = np.asarray(jnp.einsum("iip->ip", found.pairwise))
     assert own.min() > 0.97  # noise-free reads; what is left is the curvature between frames
-    assert np.asarray(found.between[0, 1]).mean() < 0.8
-    assert np.asarray(found.still).mean() < 0.8
+    assert np.asarray(found.pairwise[0, 1]).mean() < 0.8
+    assert np.asarray(found.stationary).mean() < 0.8
     judge = eqx.filter_jit(contrast)
     loss, numbers = judge(seen, SETTINGS, KEY)
-    shuffled = eqx.tree_at(lambda s: s.said.step_m, seen, seen.said.step_m[:, ::-1])
+    shuffled = eqx.tree_at(lambda s: s.trace.step_m, seen, seen.trace.step_m[:, ::-1])
     assert float(judge(shuffled, SETTINGS, KEY)[0]) > float(loss) + 1.0
-    assert float(numbers["own_wins"]) == pytest.approx(1.0)
+    assert float(numbers["contrast_accuracy"]) == pytest.approx(1.0)
 
 
 @pytest.mark.ci
@@ -114,11 +114,11 @@ def test_likelihood_tells_tags_apart_whatever_is_flipped() -> None:
     flips = np.random.default_rng(0).uniform(size=seen.reads.phase_rad.shape) < 0.1
     flipped = eqx.tree_at(lambda s: s.reads.phase_rad, seen, seen.reads.phase_rad + jnp.where(flips, jnp.pi, 0.0))
     loss, numbers = eqx.filter_jit(contrast)(flipped, settings, KEY)
-    assert float(numbers["own_wins"]) == pytest.approx(1.0)
+    assert float(numbers["contrast_accuracy"]) == pytest.approx(1.0)
     assert float(loss) < 0.1
     found = eqx.filter_jit(agreement)(flipped, settings, KEY)
     clean = eqx.filter_jit(agreement)(seen, settings, KEY)
-    own, own_clean = (np.einsum("iip->ip", np.asarray(one.between)) for one in (found, clean))
+    own, own_clean = (np.einsum("iip->ip", np.asarray(one.pairwise)) for one in (found, clean))
     # A flip costs about log(0.95 / 0.05) nats, not the read's whole weight.
     assert (own > 0.5 * own_clean).all()
     with pytest.raises(ValueError, match="flip_probability is 0"):
@@ -140,25 +140,25 @@ def test_reads_of_a_resting_tag_have_no_say() -> None:
 def test_confidence_is_best_as_the_share_of_pieces_that_are_won() -> None:
     seen = _said_with_true_steps(_clip())
     judge = jax.jit(lambda s: calibration(s, SETTINGS, KEY)[0])
-    as_sure = lambda one, p: eqx.tree_at(lambda s: s.said.confidence, one, jnp.full_like(one.said.confidence, p))  # noqa: E731
-    shuffled = eqx.tree_at(lambda s: s.said.step_m, seen, seen.said.step_m[:, ::-1])
+    as_sure = lambda one, p: eqx.tree_at(lambda s: s.trace.confidence, one, jnp.full_like(one.trace.confidence, p))  # noqa: E731
+    shuffled = eqx.tree_at(lambda s: s.trace.step_m, seen, seen.trace.step_m[:, ::-1])
     for one, share in ((seen, 1.0), (shuffled, 0.0)):  # every piece is won, and none
         _, numbers = eqx.filter_jit(contrast)(one, SETTINGS, KEY)
-        assert float(numbers["own_wins"]) == pytest.approx(share)
+        assert float(numbers["contrast_accuracy"]) == pytest.approx(share)
         for sure in (0.3, 0.9):
             expected = -np.log(sure) if share else -np.log1p(-sure)
             assert float(judge(as_sure(one, sure))) == pytest.approx(expected, rel=1e-4)
     # Tags that win and lose, each with its own confidence: only its own counts, and only the frames of the piece.
-    one_lost = eqx.tree_at(lambda s: s.said.step_m, seen, seen.said.step_m.at[:, 1].set(-seen.said.step_m[:, 1]))
-    sure = jnp.tile(jnp.array([0.8, 0.1]), (seen.said.confidence.shape[0], 1)).at[: SETTINGS.skip_frames + 1].set(0.5)
-    told = eqx.tree_at(lambda s: s.said.confidence, one_lost, sure)
-    weight = np.asarray(eqx.filter_jit(agreement)(told, SETTINGS, KEY).told_of_claim).sum(axis=1)
+    one_lost = eqx.tree_at(lambda s: s.trace.step_m, seen, seen.trace.step_m.at[:, 1].set(-seen.trace.step_m[:, 1]))
+    sure = jnp.tile(jnp.array([0.8, 0.1]), (seen.trace.confidence.shape[0], 1)).at[: SETTINGS.skip_frames + 1].set(0.5)
+    told = eqx.tree_at(lambda s: s.trace.confidence, one_lost, sure)
+    weight = np.asarray(eqx.filter_jit(agreement)(told, SETTINGS, KEY).calibration_weight).sum(axis=1)
     expected = np.average([-np.log(0.8), -np.log(0.9)], weights=weight)
     assert float(judge(told)) == pytest.approx(expected, rel=1e-4)
-    slope = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.said.confidence, told, p)))(sure)
+    slope = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.trace.confidence, told, p)))(sure)
     assert (np.asarray(slope)[SETTINGS.skip_frames + 1 :] * np.array([-1.0, 1.0]) >= 0).all()
     assert not np.asarray(slope)[: SETTINGS.skip_frames + 1].any()
-    certain = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.said.confidence, told, p)))(jnp.zeros_like(sure))
+    certain = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.trace.confidence, told, p)))(jnp.zeros_like(sure))
     assert bool(jnp.isfinite(certain).all())
 
 
@@ -166,14 +166,14 @@ def test_a_claim_that_moves_for_a_tag_that_rests_is_lost() -> None:
     seen = _said_with_true_steps(_clip())
     still = eqx.tree_at(lambda s: s.reads.phase_rad, seen, jnp.ones_like(seen.reads.phase_rad))
     judge = eqx.filter_jit(calibration)
-    sure = eqx.tree_at(lambda s: s.said.confidence, still, jnp.full_like(still.said.confidence, 0.8))
+    sure = eqx.tree_at(lambda s: s.trace.confidence, still, jnp.full_like(still.trace.confidence, 0.8))
     loss, numbers = judge(sure, SETTINGS, KEY)
     assert float(loss) == pytest.approx(-np.log1p(-0.8), rel=1e-4)
-    assert float(numbers["claims_won"]) == pytest.approx(0.0)
+    assert float(numbers["calibration_accuracy"]) == pytest.approx(0.0)
     # On what rests as well nobody can tell, whatever is flipped.
     flips = np.random.default_rng(0).uniform(size=still.reads.phase_rad.shape) < 0.1
     flipped = eqx.tree_at(lambda s: s.reads.phase_rad, sure, still.reads.phase_rad + jnp.where(flips, jnp.pi, 0.0))
-    loss, _ = judge(eqx.tree_at(lambda s: s.said.step_m, flipped, jnp.zeros_like(seen.said.step_m)), SETTINGS, KEY)
+    loss, _ = judge(eqx.tree_at(lambda s: s.trace.step_m, flipped, jnp.zeros_like(seen.trace.step_m)), SETTINGS, KEY)
     assert float(loss) == pytest.approx(0.0, abs=1e-5)
 
 
@@ -191,10 +191,10 @@ def test_future_agreement_outlines_the_moving_object() -> None:
 
 
 def _masked(clip: synthetic.SyntheticClip, mask: np.ndarray):
-    seen = eqx.filter_jit(see)(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
+    seen = eqx.filter_jit(objective_inputs)(synthetic.SmallTracer(), clip.camera, clip.frames, SETTINGS)
     height, width = clip.frames.depth_m.shape[1:]
-    whole = np.broadcast_to(mask, (clip.frames.depth_m.shape[0], seen.said.mask.shape[1], height, width))
-    return eqx.tree_at(lambda s: s.said.mask, seen, jnp.asarray(whole, jnp.float32))
+    whole = np.broadcast_to(mask, (clip.frames.depth_m.shape[0], seen.trace.mask.shape[1], height, width))
+    return eqx.tree_at(lambda s: s.trace.mask, seen, jnp.asarray(whole, jnp.float32))
 
 
 def test_priors_have_their_closed_forms() -> None:
@@ -227,12 +227,12 @@ def test_priors_have_the_gradient_of_their_masks(gradients_agree, name: str) -> 
         grown = jax.tree.map(
             lambda leaf: leaf.astype(share.dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, seen
         )
-        scaled = eqx.tree_at(lambda s: s.said.mask, grown, grown.said.mask ** (1.0 + share[0]))
+        scaled = eqx.tree_at(lambda s: s.trace.mask, grown, grown.trace.mask ** (1.0 + share[0]))
         return TERMS[name](scaled, settings, KEY)[0]
 
     gradients_agree(jax.jit(loss), (np.array([0.3]),), atol=1e-6)
-    empty = jax.jit(jax.grad(lambda m: TERMS[name](eqx.tree_at(lambda s: s.said.mask, seen, m), settings, KEY)[0]))
-    assert bool(jnp.isfinite(empty(jnp.zeros_like(seen.said.mask))).all())
+    empty = jax.jit(jax.grad(lambda m: TERMS[name](eqx.tree_at(lambda s: s.trace.mask, seen, m), settings, KEY)[0]))
+    assert bool(jnp.isfinite(empty(jnp.zeros_like(seen.trace.mask))).all())
 
 
 def test_coverage_is_what_dice_lacks_to_one() -> None:
@@ -386,15 +386,15 @@ def test_a_run_is_gone_on_with_only_where_that_is_allowed(tmp_path: Path) -> Non
     state, _ = _fresh()
     clips = synthetic.ClipCycle([synthetic.recording(40)])
     with Checkpoints(tmp_path / "run" / "checkpoints") as checkpoints:
-        with pytest.raises(CheckpointError, match=r"run holds a run already; set resume=true"):
-            resumed(state, clips, checkpoints, allowed=False)
-        again = resumed(state, clips, checkpoints, allowed=True)
+        with pytest.raises(CheckpointError, match=r"run already holds a run; set resume=true"):
+            resume_state(state, clips, checkpoints, allowed=False)
+        again = resume_state(state, clips, checkpoints, allowed=True)
     assert int(again.step) == 3
     assert clips.get_state() == {"place": 6}  # three steps of two clips
     for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(trained), strict=True):
         np.testing.assert_array_equal(one, other)
     with Checkpoints(tmp_path / "none" / "checkpoints") as checkpoints:
-        assert resumed(state, clips, checkpoints, allowed=False) is state
+        assert resume_state(state, clips, checkpoints, allowed=False) is state
 
 
 def test_resuming_is_exact_bit_for_bit(tmp_path: Path) -> None:
@@ -500,7 +500,7 @@ def test_a_run_that_diverges_stops_and_names_the_last_good_checkpoint(tmp_path: 
 
 def test_skipped_steps_do_not_push_the_last_good_checkpoint_out(tmp_path: Path) -> None:
     settings = {"checkpoint_every": 1, "stop_after_skipped": 5}
-    with pytest.raises(DivergedError, match=r"up to step 9; the last good checkpoint is step 4 in .*Go on from there"):
+    with pytest.raises(DivergedError, match=r"up to step 9; the last good checkpoint is step 4 in .*Resume from it"):
         _count(tmp_path / "late", 20, {2, *range(5, 20)}, settings=settings)
     with Checkpoints(tmp_path / "late" / "checkpoints") as checkpoints:
         assert checkpoints.steps() == [1, 3, 4]

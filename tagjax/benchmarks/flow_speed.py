@@ -16,7 +16,7 @@ from ..flow.losses import FlowLossSettings
 from ..flow.pyramid import PyramidFlow
 from ..flow.registry import make_flow
 from ..training.flow_step import FlowTrainState, flow_step
-from .timing import Timing, first_call_s, in_own_process, medians_ms, peak_memory_mib
+from .timing import Timing, first_call_s, in_separate_process, medians_ms, peak_memory_mib
 
 _BATCH, _ROWS, _COLUMNS = 8, 128, 160
 """Pairs of a training step, and their size."""
@@ -26,7 +26,7 @@ _DIS = {"dis": "DIS medium", "dis_fast": "DIS fast", "dis_ultrafast": "DIS ultra
 
 
 def moved_pictures(height: int, width: int, count: int, seed: int) -> list[np.ndarray]:
-    """RGB pictures of a texture that a smooth flow of some pixels moves on from one to the next."""
+    """RGB pictures of a texture that moves by a smooth flow of a few pixels from one picture to the next."""
     rng = np.random.default_rng(seed)
     margin = 24
     grain = rng.uniform(0, 255, (height + 2 * margin, width + 2 * margin, 3)).astype(np.float32)
@@ -42,25 +42,24 @@ def moved_pictures(height: int, width: int, count: int, seed: int) -> list[np.nd
 
 
 def _step(seed: int) -> Callable[[], Any]:
-    """A training step of the default network on a batch, as a call."""
+    """A function that does a training step of the default network on a batch."""
     optimizer = optax.adam(1e-3)
-    held = [FlowTrainState.create(PyramidFlow(seed=seed), optimizer, seed=seed)]
+    states = [FlowTrainState.create(PyramidFlow(seed=seed), optimizer, seed=seed)]
     pairs = [np.stack(moved_pictures(_ROWS, _COLUMNS, 2, seed + n)) for n in range(_BATCH)]
     samples = [{"clean": pair, "augmented": pair} for pair in pairs]
 
     def step() -> float:
-        held[0], numbers = flow_step(held[0], samples, optimizer, FlowLossSettings(), _AVERAGE_OVER)
+        states[0], numbers = flow_step(states[0], samples, optimizer, FlowLossSettings(), _AVERAGE_OVER)
         return numbers["loss"]
 
     return step
 
 
 def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timing]:
-    """One way and both ways beside DIS, the fast and the fine pyramid, smoothed ones, along a video, and a step of training.
+    """Times of flows in one and both directions against DIS, with and without smoothing, along a video, and of a training step.
 
-    The fast and the fine pyramid come as packaged; the weights of the others are untrained.
-
-    All times are of whole calls, from pictures of bytes to flow on the host.
+    The fast and the fine pyramid have their packaged weights; the others are untrained. All times are of whole calls, from
+    uint8 pictures to flow on the host.
     """
     memory = flow_memory(height, width, seed)
     pictures = moved_pictures(height, width, 4, seed)
@@ -75,48 +74,48 @@ def flow_timings(height: int, width: int, repeats: int, seed: int) -> list[Timin
     calls |= {name: lambda flow=flow: flow(first, second) for name, flow in peers.items()}
     calls["pyramid along"] = lambda: list(flow_along(network, pictures))
     calls["dis along"] = lambda: list(flow_along(peers["dis"], pictures))
-    taken = medians_ms(calls, repeats)
+    times_ms = medians_ms(calls, repeats)
     size, pairs = f"{width}x{height}", len(pictures) - 1
-    fast, dis = f"pyramid_fast, {size}, one way", ("DIS medium", taken["dis"])
+    fast, dis = f"pyramid_fast, {size}, one way", ("DIS medium", times_ms["dis"])
     timings = [
-        Timing(fast, taken["pyramid_fast"], shown, taken[name], packaged_compile_s["pyramid_fast"])
-        for name, shown in _DIS.items()
+        Timing(fast, times_ms["pyramid_fast"], label, times_ms[name], packaged_compile_s["pyramid_fast"])
+        for name, label in _DIS.items()
     ]
     timings += [
-        Timing(f"pyramid, {size}, one way", taken["pyramid"], *dis, compile_s, memory["forward"]),
-        Timing(f"pyramid_fine, {size}, one way", taken["pyramid_fine"], *dis, packaged_compile_s["pyramid_fine"]),
+        Timing(f"pyramid, {size}, one way", times_ms["pyramid"], *dis, compile_s, memory["forward"]),
+        Timing(f"pyramid_fine, {size}, one way", times_ms["pyramid_fine"], *dis, packaged_compile_s["pyramid_fine"]),
     ]
-    # Smoothing asks a flow for both of its ways.
+    # Smoothing needs the flow in both directions.
     timings += [
-        Timing(f"{name}, {size}, one way", taken[name], *dis, packaged_compile_s[name])
+        Timing(f"{name}, {size}, one way", times_ms[name], *dis, packaged_compile_s[name])
         for name in ("pyramid_fine+wls", "dis+wls")
     ]
-    both = taken["pyramid along"] / pairs, "DIS medium, both ways", taken["dis along"] / pairs
+    both = times_ms["pyramid along"] / pairs, "DIS medium, both ways", times_ms["dis along"] / pairs
     timings.append(Timing(f"pyramid, {size}, both ways, a frame of a video", *both))
     step = _step(seed)
     step_compile_s = first_call_s(step)
-    taken = medians_ms({"step": step, "pyramid": calls["pyramid"]}, max(2, repeats // 3))
+    times_ms = medians_ms({"step": step, "pyramid": calls["pyramid"]}, max(2, repeats // 3))
     what = f"training step, {_BATCH} pairs of {_COLUMNS}x{_ROWS}"
     peer = f"pyramid, {size}, one way"
-    timings.append(Timing(what, taken["step"], peer, taken["pyramid"], step_compile_s, memory["step"]))
+    timings.append(Timing(what, times_ms["step"], peer, times_ms["pyramid"], step_compile_s, memory["step"]))
     return timings
 
 
 def flow_memory(height: int, width: int, seed: int) -> dict[str, float]:
-    """Largest resident memory, MiB, of a process of its own by the end of its first flow, and of a training step.
+    """Largest resident memory, MiB, of a separate process after its first flow, and after a training step.
 
-    It contains Python and XLA, which compiles; `idle` is the process before either.
+    It includes Python and XLA's compilation; `idle` is the memory before both.
     """
     code = f"from tagjax.benchmarks.flow_speed import _report_memory; _report_memory({height}, {width}, {seed})"
-    return in_own_process(code, "The process whose memory is measured")
+    return in_separate_process(code, "The process whose memory is measured")
 
 
 def _report_memory(height: int, width: int, seed: int) -> None:
     first, second = moved_pictures(height, width, 2, seed)
     jax.block_until_ready(jax.numpy.zeros(()))
-    found = {"idle": peak_memory_mib()}
+    memory_mib = {"idle": peak_memory_mib()}
     NetworkFlow(PyramidFlow(seed=seed))(first, second)
-    found["forward"] = peak_memory_mib()
+    memory_mib["forward"] = peak_memory_mib()
     _step(seed)()
-    found["step"] = peak_memory_mib()
-    print(json.dumps(found))
+    memory_mib["step"] = peak_memory_mib()
+    print(json.dumps(memory_mib))

@@ -1,6 +1,6 @@
-"""How fast the stages are, each against a named peer that does the same, or what it replaces, in the same run.
+"""Speed of the stages, each against a peer that does the same work in the same run.
 
-Times are medians over repetitions after a warm-up, device work waited for; the ratio is ours over the peer's.
+Times are medians over repetitions after a warm-up, until device work has finished; the ratio is ours over the peer's.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .training_speed import training_timings
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkSettings:
-    """What is measured, and how long."""
+    """The measured cases, and the size of their inputs."""
 
     cases: tuple[str, ...] = ("gather", "splat", "segment", "coherence", "radio", "step", "simulate", "pairs", "flow")
     height: int = 424
@@ -44,9 +44,12 @@ class BenchmarkSettings:
     def __post_init__(self):
         unknown = sorted(set(self.cases) - set(CASES))
         if unknown or not self.cases:
-            raise ValueError(f"Unknown benchmark {', '.join(unknown) or '(none)'}; there are {', '.join(CASES)}.")
+            raise ValueError(f"cases: found {', '.join(unknown) or 'none'}; expected some of {', '.join(CASES)}.")
         if self.height < 32 or self.width < 32 or self.repeats < 1:
-            raise ValueError("A benchmark needs pictures of at least 32x32 pixels and 1 repetition.")
+            raise ValueError(
+                f"found pictures of {self.width}x{self.height} pixels and repeats={self.repeats}; expected at least 32x32 pixels "
+                "and 1 repetition."
+            )
 
 
 def _warps(settings: BenchmarkSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -90,11 +93,11 @@ def _splat(settings: BenchmarkSettings) -> Timing:
                 column, row = left + dx, top + dy
                 inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
                 weight = (1 - np.abs(u - column)) * (1 - np.abs(v - row)) * inside
-                at = np.where(inside, row * width + column, 0).ravel()
+                index = np.where(inside, row * width + column, 0).ravel()
                 for channel in range(5):
                     value = (weight * image[..., channel]).ravel()
-                    total[:, channel] += np.bincount(at, value, height * width)
-                total[:, 5] += np.bincount(at, weight.ravel(), height * width)
+                    total[:, channel] += np.bincount(index, value, height * width)
+                total[:, 5] += np.bincount(index, weight.ravel(), height * width)
         return total
 
     what = f"warp.splat, 5 channels, {width}x{height}"
@@ -109,8 +112,8 @@ def _segment(settings: BenchmarkSettings) -> Timing:
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, width), np.linspace(-0.4, 0.4, height))
     points = np.stack([x * depth, y * depth, depth], axis=-1).astype(np.float32)
     run = jax.jit(lambda p: segment(p, jnp.ones(p.shape[:2], bool), jnp.asarray(0.06), cell=8))
-    given = jnp.asarray(points)
-    compile_s = first_call_s(lambda: run(given))
+    points_device = jnp.asarray(points)
+    compile_s = first_call_s(lambda: run(points_device))
     clusters = (height // 8) * (width // 8)
     stop = (cv2.TERM_CRITERIA_MAX_ITER, 3, 0.0)
     samples = points.reshape(-1, 3)
@@ -120,7 +123,7 @@ def _segment(settings: BenchmarkSettings) -> Timing:
         return cv2.kmeans(samples, clusters, None, stop, 1, cv2.KMEANS_RANDOM_CENTERS)[0]  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     what = f"segment, {clusters} segments, {width}x{height}, 3 iterations"
-    ours = median_ms(lambda: run(given), settings.repeats)
+    ours = median_ms(lambda: run(points_device), settings.repeats)
     return Timing(what, ours, "cv2.kmeans", median_ms(peer, max(1, settings.repeats // 3)), compile_s)
 
 
@@ -175,9 +178,9 @@ def _step(settings: BenchmarkSettings) -> Timing:
 
 
 def _simulate(settings: BenchmarkSettings) -> Timing:
-    """A frame of the office with one walker, as `single_dynamic` has it: shadows, sensor noise, labels, flow both ways.
+    """A frame of the office with one walker, as in `single_dynamic`: shadows, sensor noise, labels, flow in both directions.
 
-    The first frame, which renders what never moves, is left out; reads are too.
+    The first frame, which renders the static background, is left out, and so are reads.
     """
     scenario = build_scenario(
         "handheld", np.random.default_rng(settings.seed), 2.0, {"room": "office", "num_walkers": 1}
@@ -221,13 +224,13 @@ CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing] | Iterat
     "flow": _flow,
     "training": _training,
 }
-"""What can be measured, by name."""
+"""The cases that can be measured, by name."""
 
 
 def run_benchmark(settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None) -> Iterator[Timing]:
-    """Measure case after case, giving each figure as it is found; `on_case` is told the name of the one that begins."""
+    """Measure the cases one after the other and yield each timing; `on_case` is called with the name of each case before it."""
     for name in settings.cases:
         if on_case is not None:
             on_case(name)
-        found = CASES[name](settings)
-        yield from (found,) if isinstance(found, Timing) else found
+        timings = CASES[name](settings)
+        yield from (timings,) if isinstance(timings, Timing) else timings

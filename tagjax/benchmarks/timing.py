@@ -1,4 +1,4 @@
-"""How long calls take: medians after a warm-up, and several calls that take turns."""
+"""Times of calls: medians after a warm-up, also of several calls that alternate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Timing:
     peer: str
     peer_ms: float
     compile_s: float = 0.0
-    memory_mib: float = 0.0  # largest resident memory of a process that does this alone; 0 = not measured
+    memory_mib: float = 0.0  # largest resident memory of a process that does only this; 0 = not measured
 
     @property
     def ratio(self) -> float:
@@ -37,7 +37,7 @@ def median_ms(function: Callable[[], Any], repeats: int) -> float:
 
 
 def medians_ms(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Median times of calls that take turns, so that whatever else the machine does slows all of them alike."""
+    """Median times of alternating calls, so that other load on the machine affects all of them equally."""
     for function in functions.values():
         jax.block_until_ready(function())
     times: dict[str, list[float]] = {name: [] for name in functions}
@@ -46,20 +46,20 @@ def medians_ms(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict
             start = time.perf_counter()
             jax.block_until_ready(function())
             times[name].append((time.perf_counter() - start) * 1e3)
-    return {name: float(np.median(taken)) for name, taken in times.items()}
+    return {name: float(np.median(values)) for name, values in times.items()}
 
 
 def first_call_s(function: Callable[[], Any]) -> float:
-    """Time of a call, seconds: of the first one, with what is compiled for it."""
+    """Time of the first call, seconds, including compilation."""
     start = time.perf_counter()
     jax.block_until_ready(function())
     return time.perf_counter() - start
 
 
-def in_own_process(code: str, what: str) -> dict[str, float]:
-    """What Python code prints as JSON on its last line, run in a fresh process, whose memory is then its own.
+def in_separate_process(code: str, what: str) -> dict[str, float]:
+    """The JSON on the last line that Python code prints in a fresh process, so that its memory can be measured.
 
-    Raises `RuntimeError`, naming `what`, if it fails.
+    Raises `RuntimeError` with `what` in its message if the process fails.
     """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:

@@ -1,7 +1,7 @@
-"""Time and memory of one step of tracer training against the length of its clip, each in a process of its own.
+"""Time and memory of one step of tracer training against the length of its clip, each in a separate process.
 
-Memory is the largest resident memory of the process by the end of its steps; it contains Python, XLA while it compiles,
-and the clip. On the host backend that is all there is; on a GPU it is the host's share only.
+Memory is the largest resident memory of the process after its steps, including Python, XLA's compilation, and the clip.
+On the CPU backend that is all memory; on a GPU it is the host memory only.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from ..sim.record import CaptureSettings, simulate_recording
 from ..sim.stories import build_scenario
 from ..tagattention import TagAttention
 from ..tracing.clips import Clip, ClipSettings, load_clip
-from ..training.loss import ObjectiveSettings
+from ..training.objective import ObjectiveSettings
 from ..training.state import TrainState
 from ..training.step import make_optimizer, train_step
-from .timing import Timing, in_own_process, peak_memory_mib
+from .timing import Timing, in_separate_process, peak_memory_mib
 
 LENGTHS = (12, 24, 48, 96)
 """Frames of a clip."""
@@ -30,16 +30,16 @@ _WIDTH, _HEIGHT, _STRIDE = 320, 240, 2
 
 
 def training_timings(repeats: int, seed: int) -> Iterator[Timing]:
-    """A step for each length of a clip, steps of the tracer computed again in the backward pass and kept.
+    """A training step for each clip length, with the tracer's steps recomputed in the backward pass or stored.
 
-    Each is the other's peer; both have their memory told.
+    Each variant is the other's peer; the memory of both is measured.
     """
     for length in LENGTHS:
-        again, kept = (step_cost(length, rematerialise, repeats, seed) for rematerialise in (True, False))
+        recomputed, stored = (step_cost(length, rematerialise, repeats, seed) for rematerialise in (True, False))
         what = f"training step, {length} frames of {_WIDTH // _STRIDE}x{_HEIGHT // _STRIDE}"
         for name, one, peer, other in (
-            ("computed again", again, "kept", kept),
-            ("kept", kept, "computed again", again),
+            ("recomputed", recomputed, "stored", stored),
+            ("stored", stored, "recomputed", recomputed),
         ):
             yield Timing(f"{what}, {name}", one["step_ms"], peer, other["step_ms"], one["compile_s"], one["memory_mib"])
 
@@ -50,11 +50,11 @@ def step_cost(length: int, rematerialise: bool, repeats: int, seed: int) -> dict
         "from tagjax.benchmarks.training_speed import _report_step; "
         f"_report_step({length}, {rematerialise}, {repeats}, {seed})"
     )
-    return in_own_process(code, f"A training step of {length} frames")
+    return in_separate_process(code, f"A training step of {length} frames")
 
 
 def _clip(length: int, seed: int) -> Clip:
-    """A clip of that length: three people with a badge each."""
+    """A clip of this length: three people with a badge each."""
     scenario = build_scenario("walkers", np.random.default_rng(seed), length / 10 + 1)
     capture = CaptureSettings(sensor="xtion", width=_WIDTH, frame_rate_hz=10.0)
     recording = simulate_recording(scenario, capture, seed=seed, name="training step", num_frames=length)
@@ -68,15 +68,15 @@ def _report_step(length: int, rematerialise: bool, repeats: int, seed: int) -> N
     state = TrainState.create(TagAttention(), optimizer, seed=seed)
     settings = ObjectiveSettings(rematerialise=rematerialise, skip_frames=min(12, length // 2))
     jax.block_until_ready(clip.frames)
-    found = {"idle_mib": peak_memory_mib()}
-    taken = []
+    cost = {"idle_mib": peak_memory_mib()}
+    times_s = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
-        state, _ = train_step(state, [clip], optimizer, settings)  # its numbers are on the host when it returns
-        taken.append(time.perf_counter() - start)
-    found |= {
+        state, _ = train_step(state, [clip], optimizer, settings)  # its values are on the host when it returns
+        times_s.append(time.perf_counter() - start)
+    cost |= {
         "memory_mib": peak_memory_mib(),
-        "step_ms": 1e3 * float(np.median(taken[1:])),
-        "compile_s": taken[0] - float(np.median(taken[1:])),
+        "step_ms": 1e3 * float(np.median(times_s[1:])),
+        "compile_s": times_s[0] - float(np.median(times_s[1:])),
     }
-    print(json.dumps(found))
+    print(json.dumps(cost))

@@ -1,4 +1,4 @@
-"""Flows side by side on the same pairs: scores against truth and against the pictures, tables, and panels."""
+"""Comparison of flows on the same pairs: scores against truth and against the pictures, tables, and panels."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rich.box import SIMPLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from ..core.files import write_atomic
 from ..core.machine import machine
 from ..core.results import write_json
 from ..flow.opencv import FlowFunction
@@ -38,22 +39,22 @@ _COLUMNS = {
     "warped_levels": "warped",
     "median_ms": "ms",
 }
-_SHARES = ("above_1px", "above_3px", "above_5px", "fl")
-_WORST_PX, _WORST_LEVELS = 3.0, 32.0
-"""Errors that panels show as white."""
+_FRACTIONS = ("above_1px", "above_3px", "above_5px", "fl")
+_LARGEST_PX, _LARGEST_LEVELS = 3.0, 32.0
+"""Errors from these on are white in the panels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FlowEvaluationSettings:
-    """Which flows are compared, and on what."""
+    """Which flows are compared, and on which pairs."""
 
     flows: tuple[str, ...] = ("zero", "dis_ultrafast", "dis_fast", "dis")
-    num_pairs: int = 64  # drawn ones; 0 for none
-    pair_seed: int = 2_000_003  # neither training nor validation draws from it
-    photographs: bool = False  # those of installed packages on drawn layers: other machines may have others
+    num_pairs: int = 64  # synthetic pairs; 0 for none
+    pair_seed: int = 2_000_003  # differs from the seeds of training and validation
+    photographs: bool = False  # photographs of installed packages on synthetic layers; they may differ between machines
     pairs: FlowPairSettings = dataclasses.field(default_factory=FlowPairSettings)
     recordings: tuple[str, ...] = ()
-    folders: tuple[str, ...] = ()  # of Middlebury's kind
+    folders: tuple[str, ...] = ()  # in Middlebury's format
     sequences: tuple[str, ...] = ()  # videos and folders of pictures, without truth
     every: int = 5  # of recordings and sequences, every n-th picture and the next
     max_pairs: int = 40  # of one recording or sequence
@@ -64,39 +65,41 @@ class FlowEvaluationSettings:
 
     def __post_init__(self) -> None:
         if not self.flows:
-            raise ValueError("No flow is named; give flows=[dis,pyramid], for example.")
+            raise ValueError("flows is empty; expected at least one, for example flows=[dis,pyramid].")
         if self.num_pairs < 1 and not (self.recordings or self.folders or self.sequences):
             raise ValueError(
-                "Nothing to evaluate on: num_pairs is 0, and no recordings, folders or sequences are named."
+                "Nothing to evaluate on: found num_pairs=0 and no recordings, folders or sequences; expected at least one of them."
             )
-        for name, least in (("num_pairs", 0), ("every", 1), ("max_pairs", 1), ("num_panels", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected at least {least}.")
+        for name, minimum in (("num_pairs", 0), ("every", 1), ("max_pairs", 1), ("num_panels", 0)):
+            if getattr(self, name) < minimum:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected at least {minimum}.")
 
     def materials(self) -> list[Material]:
-        """Everything that flows are evaluated on. Raises `RecordingError` for what cannot be opened."""
-        found = []
+        """The data that flows are evaluated on. Raises `RecordingError` for a path that cannot be opened."""
+        materials = []
         if self.num_pairs:
             photographs = None
             if self.photographs:
                 from ..training.flow_sources import installed_photographs, photograph_stack
 
                 photographs = photograph_stack(installed_photographs(), self.pair_seed)
-            found.append(drawn_material(self.pairs, self.num_pairs, seed=self.pair_seed, photographs=photographs))
+            materials.append(drawn_material(self.pairs, self.num_pairs, seed=self.pair_seed, photographs=photographs))
         if self.recordings:
-            found.append(recording_material(self.recordings, every=self.every, most=self.max_pairs))
-        found += [folder_material(path) for path in self.folders]
+            materials.append(recording_material(self.recordings, every=self.every, max_pairs=self.max_pairs))
+        materials += [folder_material(path) for path in self.folders]
         if self.sequences:
-            found.append(sequence_material(self.sequences, Path(self.cache), every=self.every, most=self.max_pairs))
-        return found
+            materials.append(
+                sequence_material(self.sequences, Path(self.cache), every=self.every, max_pairs=self.max_pairs)
+            )
+        return materials
 
 
 def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, Any]:
     """Score every flow on every case; `folder` then holds metrics.json, flow.md and panels/.
 
     The summary: of each material and flow the scores of all its pixels (`all`), those of each source, and the mean over
-    sources of their end-point errors. Raises `ValueError` for unknown flows, and what cannot be read: then, and on
-    Ctrl-C, unfinished.json and unfinished.md hold the scores of the cases done so far, and say where it ended.
+    sources of their end-point errors. Raises `ValueError` for unknown flows and for unreadable data. After an error, and
+    on Ctrl-C, unfinished.json and unfinished.md hold the scores of the cases done so far, and the last case.
     """
     names = _labels(settings.flows)
     flows = {label: make_flow(name) for label, name in names.items()}
@@ -111,11 +114,13 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
         for material in materials:
             task = bar.add_task(material.name, total=material.num_cases)
             scored = _Scored(flows, settings)
-            wanted = set(np.linspace(0, material.num_cases - 1, settings.num_panels).round().astype(int).tolist())
+            panel_numbers = set(
+                np.linspace(0, material.num_cases - 1, settings.num_panels).round().astype(int).tolist()
+            )
             done = 0
             try:
                 for number, case in enumerate(material.cases()):
-                    scored.add(case, folder / "panels" if number in wanted else None)
+                    scored.add(case, folder / "panels" if number in panel_numbers else None)
                     done += 1
                     bar.advance(task)
             except BaseException as error:
@@ -125,11 +130,11 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
                     ended = f"{done} of {material.num_cases} cases of {material.name} were scored when it ended"
                     summary["unfinished"] = f"{ended} ({type(error).__name__}: {error})."
                     _write(summary, folder, "unfinished.json", "unfinished.md")
-                    error.add_note(f"The scores of what was done before are in {folder / 'unfinished.md'}.")
+                    error.add_note(f"The scores of the finished cases are in {folder / 'unfinished.md'}.")
                 raise
             summary["materials"][material.name] = scored.result()
     _write(summary, folder, "metrics.json", "flow.md")
-    for name in ("unfinished.json", "unfinished.md"):  # of an earlier call
+    for name in ("unfinished.json", "unfinished.md"):  # from an earlier call
         (folder / name).unlink(missing_ok=True)
     return summary
 
@@ -137,15 +142,15 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
 def _write(summary: Mapping[str, Any], folder: Path, numbers: str, tables: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / numbers, summary)
-    (folder / tables).write_text(markdown(summary), encoding="utf-8")
+    write_atomic(folder / tables, markdown(summary))
 
 
 def _labels(names: Sequence[str]) -> dict[str, str]:
-    """Short names of flows: weights by the name of their file, or by the whole path where two share it."""
+    """Short names of flows: weights by the name of their file, or by the whole path where two files have the same name."""
     short = []
     for name in names:
-        flow, rest = split_suffixes(name)
-        short.append(Path(flow).stem + rest if Path(flow).suffix == ".safetensors" else name)
+        flow, suffixes = split_suffixes(name)
+        short.append(Path(flow).stem + suffixes if Path(flow).suffix == ".safetensors" else name)
     return {stem if short.count(stem) == 1 else name: name for stem, name in zip(short, names, strict=True)}
 
 
@@ -177,25 +182,25 @@ class _Scored:
     def _call(self, name: str, case: FlowCase) -> np.ndarray:
         start = time.perf_counter()
         flow = np.asarray(jax.block_until_ready(self._flows[name](case.first, case.second)))
-        # What is compiled for a size is compiled in its first call.
+        # The first call of a size includes compilation.
         if case.first.shape in self._shapes:
             self._ms[name].append(1e3 * (time.perf_counter() - start))
         return flow
 
     def result(self) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        results: dict[str, Any] = {}
         for name, sources in self._scores.items():
             total = FlowScores()
             for score in sources.values():
                 total = total.merge(score)
             each = {source: score.result() for source, score in sources.items()}
             errors = [scores["epe_px"] for scores in each.values() if scores.get("epe_px") is not None]
-            found[name] = {
+            results[name] = {
                 "all": {**total.result(), "median_ms": float(np.median(self._ms[name])) if self._ms[name] else None},
                 "mean_epe_px": float(np.mean(np.asarray(errors, float))) if errors else None,
                 "sources": each,
             }
-        return found
+        return results
 
 
 def _panel(case: FlowCase, flows: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -205,21 +210,21 @@ def _panel(case: FlowCase, flows: Mapping[str, np.ndarray]) -> np.ndarray:
     else:
         parts = {name: warped_error(case.first, case.second, flow) for name, flow in flows.items()}
         errors = {name: np.where(inside, error, np.nan) for name, (error, inside) in parts.items()}
-    unit, largest = ("px", _WORST_PX) if truth is not None else ("levels", _WORST_LEVELS)
+    unit, largest = ("px", _LARGEST_PX) if truth is not None else ("levels", _LARGEST_LEVELS)
     return flow_panel(case.first, case.second, truth, flows, errors, largest_error=largest, unit=unit)
 
 
-def _rows(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows of one material's scores; columns that nothing is known of are left out."""
-    shown = [key for key in _COLUMNS if any(flow["all"].get(key) is not None for flow in found.values())]
-    rows = [[name, *(_text(key, flow["all"].get(key)) for key in shown)] for name, flow in found.items()]
+def _rows(scores: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows of one material's scores; columns without any value are left out."""
+    shown = [key for key in _COLUMNS if any(flow["all"].get(key) is not None for flow in scores.values())]
+    rows = [[name, *(_text(key, flow["all"].get(key)) for key in shown)] for name, flow in scores.items()]
     return ["flow", *(_COLUMNS[key] for key in shown)], rows
 
 
-def _source_rows(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]] | None:
+def _source_rows(scores: Mapping[str, Any]) -> tuple[list[str], list[list[str]]] | None:
     """Headings and rows of end-point errors by source; None for a single one, or without truth."""
-    sources = list(next(iter(found.values()))["sources"])
-    if not 2 <= len(sources) <= 8 or all(flow["mean_epe_px"] is None for flow in found.values()):
+    sources = list(next(iter(scores.values()))["sources"])
+    if not 2 <= len(sources) <= 8 or all(flow["mean_epe_px"] is None for flow in scores.values()):
         return None
     rows = [
         [
@@ -227,7 +232,7 @@ def _source_rows(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]] 
             *(_text("epe_px", flow["sources"][source].get("epe_px")) for source in sources),
             _text("epe_px", flow["mean_epe_px"]),
         ]
-        for name, flow in found.items()
+        for name, flow in scores.items()
     ]
     return ["EPE px", *sources, "mean"], rows
 
@@ -235,23 +240,23 @@ def _source_rows(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]] 
 def _text(key: str, value: float | None) -> str:
     if value is None:
         return "-"
-    if key in _SHARES:
+    if key in _FRACTIONS:
         return f"{100 * value:.1f}"
     return f"{value:.1f}" if key in ("warped_levels", "median_ms") else f"{value:.3f}"
 
 
 def _tables(summary: Mapping[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
     tables = []
-    for material, found in summary["materials"].items():
-        tables.append((material, *_rows(found)))
-        if (by_source := _source_rows(found)) is not None:
-            tables.append((f"{material}, each", *by_source))
+    for material, scores in summary["materials"].items():
+        tables.append((material, *_rows(scores)))
+        if (by_source := _source_rows(scores)) is not None:
+            tables.append((f"{material}, by source", *by_source))
     return tables
 
 
 def flow_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """The scores as tables for a terminal, one or two a material."""
-    drawn = []
+    """The scores as tables for a terminal, one or two per material."""
+    tables = []
     for title, headings, rows in _tables(summary):
         table = Table(title=title, box=SIMPLE, pad_edge=False)
         for number, heading in enumerate(headings):
@@ -259,12 +264,12 @@ def flow_tables(summary: Mapping[str, Any]) -> list[Table]:
             table.add_column(heading, justify="right" if number else "left", no_wrap=True, min_width=widest)
         for row in rows:
             table.add_row(*row)
-        drawn.append(table)
-    return drawn
+        tables.append(table)
+    return tables
 
 
 def markdown(summary: Mapping[str, Any]) -> str:
-    """The same tables as Markdown; first of all, whether they are not of all cases."""
+    """The same tables as Markdown, after a note if not all cases were scored."""
     parts = [f"**Unfinished**: {summary['unfinished']}\n"] if "unfinished" in summary else []
     for title, headings, rows in _tables(summary):
         lines = [headings, ["---", *["---:"] * (len(headings) - 1)], *rows]

@@ -1,4 +1,4 @@
-"""Pairs of pictures that flows are evaluated on: drawn ones, recordings, folders of Middlebury's kind, and videos."""
+"""Pairs of pictures for the evaluation of flows: synthetic ones, recordings, folders in Middlebury's format, and videos."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _NAMES = ("frame10.png", "frame11.png", "flow10.flo")
 
 @dataclasses.dataclass(frozen=True)
 class FlowCase:
-    """Two pictures, uint8 or floats from 0 to 1, and what is known of the flow from the first to the second."""
+    """Two pictures, uint8 or floats from 0 to 1, and the true flow from the first to the second where it is known."""
 
-    source: str  # scene, recording or video that it is from
+    source: str  # its scene, recording or video
     label: str
     first: Shaped[np.ndarray, "height width 3"]
     second: Shaped[np.ndarray, "height width 3"]
@@ -37,7 +37,7 @@ class FlowCase:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """A number of cases, made one after the other when they are asked for."""
+    """A number of cases, which `cases` computes one after the other."""
 
     name: str
     num_cases: int
@@ -51,7 +51,7 @@ def drawn_material(
     seed: int,
     photographs: UInt8[np.ndarray, "count rows columns 3"] | None = None,
 ) -> Material:
-    """Drawn pairs with exact flow."""
+    """Synthetic pairs with exact flow."""
 
     def cases() -> Iterator[FlowCase]:
         for start in range(0, num_pairs, _BATCH):
@@ -66,11 +66,11 @@ def drawn_material(
     return Material("drawn pairs", num_pairs, cases)
 
 
-def recording_material(paths: tuple[str, ...], *, every: int, most: int) -> Material:
-    """Every `every`-th frame and the next of recordings, `most` of each; with their exact flow where they hold it."""
+def recording_material(paths: tuple[str, ...], *, every: int, max_pairs: int) -> Material:
+    """Every `every`-th frame and the next of recordings, at most `max_pairs` of each; with their exact flow where they hold it."""
     recordings = [open_recording(path) for path in paths]
-    names = _told_apart([recording.name for recording in recordings])
-    frames = [_chosen(recording.num_frames, every, most, recording.name) for recording in recordings]
+    names = _unique_names([recording.name for recording in recordings])
+    frames = [_frames(recording.num_frames, every, max_pairs, recording.name) for recording in recordings]
 
     def cases() -> Iterator[FlowCase]:
         for name, recording, chosen in zip(names, recordings, frames, strict=True):
@@ -95,7 +95,7 @@ def folder_material(path: str) -> Material:
     scenes = [root] if (root / _NAMES[0]).is_file() else sorted(p.parent for p in root.glob(f"*/{_NAMES[0]}"))
     if not scenes:
         raise RecordingError(
-            f"{path}: no {_NAMES[0]}, here or in folders within; expected scenes as Middlebury has them."
+            f"{path}: no {_NAMES[0]}, here or in its subfolders; expected scenes in Middlebury's format."
         )
 
     def cases() -> Iterator[FlowCase]:
@@ -103,17 +103,19 @@ def folder_material(path: str) -> Material:
             first, second = (_picture(scene / name) for name in _NAMES[:2])
             truth = read_flo(scene / _NAMES[2]) if (scene / _NAMES[2]).is_file() else None
             if truth is not None and truth.shape[:2] != first.shape[:2]:
-                raise RecordingError(f"{scene}: a flow of {truth.shape[:2]} pixels for a picture of {first.shape[:2]}.")
+                raise RecordingError(
+                    f"{scene}: found flow of {truth.shape[:2]} pixels; expected {first.shape[:2]}, the size of the picture."
+                )
             yield FlowCase(scene.name, scene.name, first, second, truth)
 
     return Material(root.name, len(scenes), cases)
 
 
-def sequence_material(paths: tuple[str, ...], cache: Path, *, every: int, most: int) -> Material:
-    """Every `every`-th picture and the next of videos and folders of pictures, `most` of each; without truth."""
-    names = _told_apart([Path(path).stem for path in paths])
+def sequence_material(paths: tuple[str, ...], cache: Path, *, every: int, max_pairs: int) -> Material:
+    """Every `every`-th picture and the next of videos and folders of pictures, at most `max_pairs` of each; without truth."""
+    names = _unique_names([Path(path).stem for path in paths])
     sequences = [(name, open_sequence(path, cache)) for name, path in zip(names, paths, strict=True)]
-    frames = [_chosen(sequence.shape[0], every, most, name) for name, sequence in sequences]
+    frames = [_frames(sequence.shape[0], every, max_pairs, name) for name, sequence in sequences]
 
     def cases() -> Iterator[FlowCase]:
         for (name, sequence), chosen in zip(sequences, frames, strict=True):
@@ -123,21 +125,21 @@ def sequence_material(paths: tuple[str, ...], cache: Path, *, every: int, most: 
     return Material("without truth", sum(map(len, frames)), cases)
 
 
-def _told_apart(names: Sequence[str]) -> list[str]:
-    """The names, numbered where several are alike."""
+def _unique_names(names: Sequence[str]) -> list[str]:
+    """The names, numbered where several are equal."""
     return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names)]
 
 
-def _chosen(count: int, every: int, most: int, name: str) -> range:
+def _frames(count: int, every: int, max_pairs: int, name: str) -> range:
     if count < 2:
-        raise RecordingError(f"{name} holds {count} picture; a flow needs at least two.")
-    return range(0, count - 1, every)[:most]
+        raise RecordingError(f"{name} found {count} picture; expected at least two.")
+    return range(0, count - 1, every)[:max_pairs]
 
 
 def _picture(path: Path) -> np.ndarray:
     """RGB; 16 bits become floats from 0 to 1."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if picture is None:
-        raise RecordingError(f"{path} is missing or cannot be read as a picture.")
+        raise RecordingError(f"{path} is missing or not a readable picture.")
     picture = np.ascontiguousarray(picture[..., ::-1])
     return picture if picture.dtype == np.uint8 else check_images(picture, picture)[0]

@@ -1,4 +1,4 @@
-"""A whole evaluation: a trained run (or an untrained tracer) on named recordings, with a report."""
+"""A whole evaluation: a training run, learned weights or an untrained tracer on recordings, with a report."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from ..tagattention.tracer_settings import learned_tracer, make_tracer, tracer_c
 from ..tracing.clips import ClipSettings
 from ..training.checkpoint import Checkpoints
 from ..training.config import TrainConfig
-from ..training.run import evaluate_tracers, initial_state, own_flow
+from ..training.evaluate import evaluate_tracers
+from ..training.run import evaluation_flow, initial_state
 from ..training.sources import DataSettings, training_recordings
 from ..training.state import TrainState
 
 
 def restore_state(run: Path, config: TrainConfig, *, step: int | None = None) -> TrainState:
-    """The state of a run's checkpoint (the newest if `step` is None), built as the run's own configuration says."""
-    # What it began with is replaced, and may be gone.
+    """The state of a run's checkpoint (the newest if `step` is None), built from the run's own configuration."""
+    # The initial weights are overwritten by the checkpoint, and their files may no longer exist.
     joint = None if config.joint is None else dataclasses.replace(config.joint, init=None)
     fresh, _ = initial_state(dataclasses.replace(config, weights=None, joint=joint))
     with Checkpoints(run / "checkpoints", create=False) as checkpoints:
@@ -30,8 +31,8 @@ def restore_state(run: Path, config: TrainConfig, *, step: int | None = None) ->
     return state
 
 
-def held_out(data: DataSettings) -> list[Recording]:
-    """The recordings that a run held out, without a look at those that it learned from."""
+def validation_recordings(data: DataSettings) -> list[Recording]:
+    """The validation recordings of a run; its training recordings are not opened."""
     if not data.recordings:
         return training_recordings(data)[1]
     return open_recordings(data.validation, data.virtual_tag)
@@ -42,9 +43,9 @@ def run_evaluation(
 ) -> dict[str, Any]:
     """Evaluate and return the report's summary, which is also written to `folder`.
 
-    `run_values` is the configuration found in the run folder. What `config` leaves open is taken from it, or else from the
-    file of learned parameters or the tracer's configuration. Without recordings the run's own held-out ones are used. Raises
-    `ConfigError` where nothing names a tracer or a recording.
+    `run_values` is the configuration in the run folder. Settings that are None in `config` are taken from it, or else from
+    the file of learned parameters or the tracer's configuration. Without recordings those of the run's validation are used.
+    Raises `ConfigError` where there is no tracer or no recording.
     """
     clips, scores, baselines, recordings = ClipSettings(), ScoreSettings(), dict(config.baselines or {}), []
     estimators = dict(config.baseline_estimators or {})
@@ -55,12 +56,12 @@ def run_evaluation(
         trained = from_mapping(TrainConfig, run_values)
         state = restore_state(Path(config.run), trained, step=config.checkpoint)
         tracers = {"learned": state.tracer}
-        flows = {"learned": own_flow(state.model, trained, folder / "flow.safetensors")}
+        flows = {"learned": evaluation_flow(state.model, trained, folder / "flow.safetensors")}
         clips, scores = trained.data.clips, trained.scores
         baselines = dict(trained.baselines) if config.baselines is None else baselines
         estimators = dict(trained.baseline_estimators) | estimators
         if not config.recordings:
-            recordings = held_out(trained.data)
+            recordings = validation_recordings(trained.data)
     elif config.weights is not None:
         tracer, clips = learned_tracer(config.weights, config.tracer)
         tracers = {"learned": tracer}
@@ -76,7 +77,7 @@ def run_evaluation(
     recordings += open_recordings(config.recordings, config.virtual_tag)
     if not recordings:
         raise ConfigError(
-            "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with held-out recordings."
+            "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with validation recordings."
         )
     tracers |= {name: make_tracer(settings) for name, settings in baselines.items()}
     return evaluate_tracers(
@@ -95,24 +96,22 @@ def run_evaluation(
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateConfig:
-    """All settings of an evaluation. What is None is taken from the run, the weights, or the tracer's configuration."""
+    """All settings of an evaluation. A value of None is taken from the run, the weights, or the tracer's configuration."""
 
     run: str | None = None  # a run folder of experiments.train
     checkpoint: int | None = None  # step; the newest if None
     tracer: Mapping[str, Any] | None = None
-    weights: str | None = (
-        None  # learned parameters: `default`, a name, or a file; they name their tracer if `tracer` is None
-    )
+    weights: str | None = None  # learned parameters: `default`, a name, or a file, with its tracer if `tracer` is None
     recordings: tuple[str, ...] = ()
     epcs: tuple[str, ...] | None = None
     frames: tuple[int, int] | None = None
     clips: Mapping[str, Any] = dataclasses.field(
         default_factory=dict
-    )  # in place of the run's, the weights' or the tracer's
+    )  # override those of the run, the weights or the tracer
     baselines: Mapping[str, Mapping[str, Any]] | None = None
     baseline_estimators: Mapping[str, str] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
-    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the run's
+    scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # override those of the run
     progress: bool = True
 
     def __post_init__(self) -> None:

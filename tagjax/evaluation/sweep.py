@@ -1,12 +1,11 @@
 """A grid of a tracer's parameters over suites: IoU against frame number, a table, and the best point.
 
 TagAttention (ToN 2021), Fig. 17 is such a sweep: v0 at 0.01, 0.1 and 0.5 m/s, for a slow and for a fast object. Every
-recording at every point is a line of a file, so that a killed sweep resumes.
+recording at every point is a line of a file, so that an interrupted sweep can be resumed.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 import itertools
@@ -18,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.results import to_json_values
+from ..core.files import write_atomic
+from ..core.results import markdown_table, to_json_values, write_csv
 from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording.store import open_recording
@@ -27,23 +27,23 @@ from ..sim.suites import SPLITS, Item, Suite, make_items
 from ..tagattention.tracer_settings import make_tracer, tracer_clips
 from ..tracing.clips import ClipSettings, clip_loader
 
-_FEW = 6
-"""Up to this many points have a curve each; more are shown by parameter."""
+_MAX_CURVES = 6
+"""Up to this many points are plotted as one curve each; more are plotted by parameter."""
 
 _LINES = "lines.jsonl"
 
 Value = int | float | str | bool
-"""A parameter's value; whole numbers and texts keep their type."""
+"""A parameter's value; integers and strings keep their type."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepConfig:
-    """The grid and the suites; `suites` has the settings of each by name, as in the files of conf/suite."""
+    """The grid and the suites; `suites` holds the settings of each suite by name, as in the files of conf/suite."""
 
     suites: Mapping[str, Mapping[str, Any]]
     tracer: Mapping[str, Any]
     grid: Mapping[str, tuple[Value, ...]]  # values of the tracer's parameters; all combinations are tried
-    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in place of the tracer's
+    clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # override the tracer's
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
     recordings_dir: str = "recordings"
     splits: tuple[str, ...] = ("test",)
@@ -66,7 +66,7 @@ class SweepConfig:
             raise ConfigError(f"grid: found {', '.join(unknown)}; expected parameters of the tracer, some of {known}.")
 
     def clip_settings(self) -> ClipSettings:
-        """Those of the tracer's configuration, with the values of `clips` in their places."""
+        """The clip settings of the tracer's configuration, overridden by `clips`."""
         return changed(tracer_clips(self.tracer), self.clips, where="clips")
 
     def points(self) -> list[dict[str, Value]]:
@@ -78,7 +78,7 @@ class SweepConfig:
 class Line:
     """One recording at one point of the grid."""
 
-    key: str  # hash of everything that determines the numbers
+    key: str  # hash of everything that determines the results
     condition: str  # suite and variant
     recording: str
     point: Mapping[str, Value]
@@ -97,7 +97,9 @@ def run_sweep(
     report = on_progress or (lambda done, total, name: None)
     folder.mkdir(parents=True, exist_ok=True)
     points, clips = config.points(), config.clip_settings()
-    tracers = [make_tracer({**config.tracer, **point}) for point in points]  # a wrong value raises before the work
+    tracers = [
+        make_tracer({**config.tracer, **point}) for point in points
+    ]  # a wrong value raises before the work starts
     work = [
         (suite, item)
         for name, values in config.suites.items()
@@ -149,20 +151,20 @@ def _items(config: SweepConfig, suite: Suite, report: Callable[[str], None]) -> 
 
 
 def _caching_loader(clips: ClipSettings) -> Callable[..., Any]:
-    """A loader that keeps the loaded clips: every point of the grid sees the same."""
-    load_piece, held = clip_loader(clips), {}
+    """A loader that caches the clips, so that they are loaded once for all points of the grid."""
+    load_piece, cache = clip_loader(clips), {}
 
     def load(recording: Any, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Any:
         key = (recording.reversed_from is None, start, stop, None if epcs is None else tuple(epcs))
-        if key not in held:
-            held[key] = load_piece(recording, start, stop, epcs=epcs)
-        return held[key]
+        if key not in cache:
+            cache[key] = load_piece(recording, start, stop, epcs=epcs)
+        return cache[key]
 
     return load
 
 
 def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, Value]) -> str:
-    scene = {**dataclasses.asdict(suite), "counts": None}  # the number of other recordings changes nothing
+    scene = {**dataclasses.asdict(suite), "counts": None}  # the number of other recordings has no influence
     parts = [
         scene,
         item.name,
@@ -178,14 +180,14 @@ def _condition(item: Item) -> str:
 
 
 def frame_iou(result: RecordingResult) -> tuple[float | None, ...]:
-    """Box IoU of every frame, mean over the visible tags; None where none is."""
+    """Box IoU of every frame, mean over the visible tags; None where none is visible."""
     frames = list(result.frames.values())
     if not frames:
         return ()
     iou = np.stack([np.where(one.detected, one.iou, 0.0) for one in frames])
-    shown = np.stack([one.visible for one in frames])
-    count = shown.sum(axis=0)
-    mean = (iou * shown).sum(axis=0) / np.maximum(count, 1)
+    visible = np.stack([one.visible for one in frames])
+    count = visible.sum(axis=0)
+    mean = (iou * visible).sum(axis=0) / np.maximum(count, 1)
     return tuple(round(float(value), 4) if n else None for value, n in zip(mean, count, strict=True))
 
 
@@ -199,10 +201,10 @@ def read_lines(path: Path) -> list[Line]:
     if not path.exists():
         return []
     text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        path.write_text(whole, encoding="utf-8")
-    rows = [json.loads(row) for row in whole.splitlines()]
+    complete = text[: text.rfind("\n") + 1]
+    if complete != text:
+        write_atomic(path, complete)
+    rows = [json.loads(row) for row in complete.splitlines()]
     return [Line(**{**row, "iou": tuple(row["iou"])}) for row in rows]
 
 
@@ -214,7 +216,7 @@ def point_name(point: Mapping[str, Value]) -> str:
 def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
     """A row for each point, the best first: mean box IoU over conditions, and IoU and lock of each condition.
 
-    Within a condition every scored frame counts the same; the conditions count the same.
+    Within a condition every scored frame has the same weight, and every condition has the same weight.
     """
     rows: dict[str, dict[str, Any]] = {}
     groups: dict[tuple[str, str], list[Line]] = {}
@@ -236,16 +238,15 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
     """table.csv, table.md and sweep.png."""
     rows = table(lines)
     conditions = list(dict.fromkeys(line.condition for line in lines))
-    heads = [*config.grid, "IoU", *(f"{one}: {what}" for one in conditions for what in ("IoU", "locked"))]
-    with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, heads)
-        writer.writeheader()
-        writer.writerows(rows)
-    cells = [[value_text(row[head]) if head in config.grid else f"{row[head]:.3f}" for head in heads] for row in rows]
-    text = [" | ".join(row) for row in (heads, ["---"] * len(heads), *cells)]
-    (folder / "table.md").write_text("".join(f"| {row} |\n" for row in text), encoding="utf-8")
+    headings = [*config.grid, "IoU", *(f"{one}: {what}" for one in conditions for what in ("IoU", "locked"))]
+    write_csv(folder / "table.csv", headings, ([row[heading] for heading in headings] for row in rows))
+    cells = [
+        [value_text(row[heading]) if heading in config.grid else f"{row[heading]:.3f}" for heading in headings]
+        for row in rows
+    ]
+    write_atomic(folder / "table.md", markdown_table(headings, cells) + "\n")
     points = config.points()
-    if len(points) <= _FEW:
+    if len(points) <= _MAX_CURVES:
         curves = {
             condition: {
                 point_name(point): _mean_curve(
@@ -265,7 +266,7 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
 
 
 def _mean_curve(ones: Sequence[Sequence[float | None]]) -> np.ndarray:
-    """Mean over recordings by frame; NaN where none shows anything."""
+    """Mean over recordings by frame; NaN where no tag is visible in any."""
     length = max((len(one) for one in ones), default=0)
     padded = np.full((len(ones), length), np.nan)
     for row, one in zip(padded, ones, strict=True):

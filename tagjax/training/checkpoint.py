@@ -1,8 +1,8 @@
-"""Checkpoints: everything a run needs to go on exactly where it stopped, written atomically by Orbax.
+"""Checkpoints: everything that a run needs to resume exactly where it stopped, written atomically by Orbax.
 
 A checkpoint holds the arrays of the training state (never code or pickles), the state of the data iterator and a
-description of the arrays, which is compared before anything is restored. Of several processes only the first touches
-the folder: it needs no file system that all of them share.
+description of the arrays, which is compared before anything is restored. With several processes
+only process 0 reads and writes the folder, so no shared file system is needed.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
-from .processes import arrays_of_first, is_first, plain_of_first
-from .state import Stepped
+from .processes import broadcast_arrays, broadcast_json, is_first
+from .state import HasStep
 
-StateT = TypeVar("StateT", bound=Stepped)
+StateT = TypeVar("StateT", bound=HasStep)
 
 FORMAT = "tagjax training checkpoint 1"
 
@@ -47,7 +47,7 @@ class Checkpoints:
             return
         if not create and not self.folder.is_dir():
             raise CheckpointError(
-                f"No checkpoints at {self.folder}: no such folder. Name a run folder written by experiments.train."
+                f"No checkpoints at {self.folder}: no such folder. Give a run folder written by experiments.train."
             )
         self.folder.mkdir(parents=True, exist_ok=True)
         options = ocp.CheckpointManagerOptions(
@@ -74,17 +74,17 @@ class Checkpoints:
             self._manager.close()
 
     def steps(self) -> list[int]:
-        """Steps at which a finished checkpoint exists, ascending. To be asked by all processes."""
-        return plain_of_first([] if self._manager is None else sorted(self._manager.all_steps()))
+        """Steps at which a finished checkpoint exists, ascending. All processes must call this."""
+        return broadcast_json([] if self._manager is None else sorted(self._manager.all_steps()))
 
-    def save(self, state: Stepped, data_state: Any) -> None:
+    def save(self, state: HasStep, data_state: Any) -> None:
         """Write a checkpoint of the state at its step; `data_state` is plain JSON (the iterator's own state)."""
         if self._manager is None:
             return
         step = int(state.step)
         if step in self._manager.all_steps():
             return
-        # Flat and named by number: Orbax then needs no knowledge of our classes, and nothing is pickled.
+        # A flat dictionary keyed by number: Orbax needs no knowledge of the classes, and nothing is pickled.
         arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
         about = {"format": FORMAT, "step": step, "arrays": describe_arrays(state), "data": _jsonable(data_state)}
         self._manager.save(
@@ -99,19 +99,19 @@ class Checkpoints:
     def restore(self, like: StateT, step: int | None = None) -> tuple[StateT, Any]:
         """The state at `step` (the newest if None) and the data iterator's state.
 
-        `like` is a fresh state of the same configuration: it gives the structure, the checkpoint the arrays. A folder
-        without checkpoint, a foreign or damaged one, or one of another model raises `CheckpointError`. To be asked by
-        all processes.
+        `like` is a fresh state of the same configuration: it gives the structure, the checkpoint the arrays. Raises
+        `CheckpointError` for a folder without a checkpoint, and for a checkpoint that is damaged or belongs to another
+        program or model. All processes must call this.
         """
         state, data_state = (like, None) if self._manager is None else self._read(self._manager, like, step)
-        return arrays_of_first(state), plain_of_first(data_state)
+        return broadcast_arrays(state), broadcast_json(data_state)
 
     def _read(self, manager: ocp.CheckpointManager, like: StateT, step: int | None) -> tuple[StateT, Any]:
         steps = sorted(manager.all_steps())
         if not steps:
             inside = ", ".join(sorted(path.name for path in self.folder.iterdir())[:6]) or "nothing"
             raise CheckpointError(
-                f"No finished checkpoint at {self.folder} (it holds {inside}). Name a run folder written by "
+                f"No finished checkpoint at {self.folder} (it holds {inside}). Give a run folder written by "
                 "experiments.train that has done at least one step."
             )
         step = steps[-1] if step is None else step
@@ -119,7 +119,7 @@ class Checkpoints:
             raise CheckpointError(f"No checkpoint of step {step} at {self.folder}; there are {steps}.")
         about = self._about(manager, step)
         _compare(about["arrays"], describe_arrays(like), self.folder / str(step))
-        arrays, rest = eqx.partition(like, eqx.is_array)
+        arrays, static = eqx.partition(like, eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
         wanted = {
             f"{n:04d}": jax.ShapeDtypeStruct(
@@ -128,13 +128,13 @@ class Checkpoints:
             for n, leaf in enumerate(leaves)
         }
         try:
-            found = manager.restore(step, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(wanted)))["arrays"]
+            restored = manager.restore(step, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(wanted)))["arrays"]
         except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
             raise CheckpointError(
                 f"The checkpoint {self.folder / str(step)} is damaged: its arrays cannot be read "
                 f"({type(error).__name__}). Delete that folder to go on from an older one; there are {steps}."
             ) from error
-        state = eqx.combine(jax.tree.unflatten(structure, [found[f"{n:04d}"] for n in range(len(leaves))]), rest)
+        state = eqx.combine(jax.tree.unflatten(structure, [restored[f"{n:04d}"] for n in range(len(leaves))]), static)
         return state, about["data"]
 
     def _about(self, manager: ocp.CheckpointManager, step: int) -> dict[str, Any]:

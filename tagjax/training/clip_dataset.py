@@ -1,4 +1,4 @@
-"""Training clips: which stretches of recordings are drawn, with which tags, and in which order."""
+"""Training clips: which sections of the recordings are sampled, with which tags, and in which order."""
 
 from __future__ import annotations
 
@@ -28,42 +28,42 @@ from ..tracing.clips import (
 from ..tracing.motion_evidence import coherence_loss
 
 _PIECE_S = 0.5
-"""In pieces of this length a clip's reads are asked for motion."""
+"""Length of the pieces in which a clip's reads are tested for motion."""
 
 
-def motion_heard(
+def measured_motion(
     recording: Recording, starts: Sequence[int], length: int, epcs: Sequence[str], antennas: Sequence[int]
 ) -> np.ndarray:
-    """How much each tag moves in each clip, by its reads alone: (clips, tags), of the antenna that tells most.
+    """How much each tag moves in each clip, from its reads alone: (clips, tags); the largest value over the antennas.
 
-    The mean over a clip's pieces of half a second of the coherence that reads, modulo pi, lose by taking the tag to rest
-    (`tagjax.tracing.motion_evidence`): some 0.02 by noise where nothing moves, 0.2 to 0.6 where a hand waves.
+    The mean over the clip's pieces of half a second of the coherence, modulo pi, that the reads lose if the tag is assumed
+    stationary (`tagjax.tracing.motion_evidence`): about 0.02 from noise for a stationary tag, 0.2 to 0.6 for a waving hand.
     """
     time_s = recording.frame_time_s()
     edges = np.arange(time_s[0], time_s[-1] + _PIECE_S, _PIECE_S)
-    most = np.zeros((len(starts), len(epcs)))
+    motion = np.zeros((len(starts), len(epcs)))
     for (tag, epc), antenna in itertools.product(enumerate(epcs), antennas):
         reads = recording.reads.select(epc)
         lost = coherence_loss(reads[reads.antenna == antenna], edges, int(recording.time_ns[0]))
         for number, start in enumerate(starts):
             first, last = np.searchsorted(edges, time_s[[start, start + length - 1]], side="right") - 1
-            most[number, tag] = max(most[number, tag], lost[first : last + 1].mean())
-    return most
+            motion[number, tag] = max(motion[number, tag], lost[first : last + 1].mean())
+    return motion
 
 
-def _drawn_tags(heard: np.ndarray, max_tags: int | None, seed: tuple[int, ...]) -> list[int]:
-    """The number of the tag that is heard to move most, and of the others as many as there is room for, by chance."""
-    moving = int(heard.argmax())
-    others = np.random.default_rng(seed).permutation(np.delete(np.arange(len(heard)), moving))
+def _choose_tags(motion: np.ndarray, max_tags: int | None, seed: tuple[int, ...]) -> list[int]:
+    """Numbers of the tag with the most motion and of random others, `max_tags` in all."""
+    moving = int(motion.argmax())
+    others = np.random.default_rng(seed).permutation(np.delete(np.arange(len(motion)), moving))
     return sorted([moving, *others.tolist()][:max_tags])
 
 
 class _ClipSource:
     """Every clip of `length` frames that starts on a multiple of `step`, as Grain's random access source.
 
-    Of these only clips in which the radio hears some tag move, by `min_motion` or more (`motion_heard`), each with
-    `max_tags` of its tags. Warns (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for those
-    of which no clip can be loaded, which would else be found when the first one is drawn.
+    Only clips in which the reads of some tag show motion of `min_motion` or more (`measured_motion`) are included, each
+    with `max_tags` of its tags. Warns (`RecordingWarning`) of recordings that are shorter. Raises `RecordingError` for
+    recordings of which no clip can be loaded, before the first clip is sampled.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class _ClipSource:
         **settings: Any,
     ):
         self._recordings, self._length, self._settings = list(recordings), length, settings
-        self._on_host = on_host  # NumPy arrays, which one process can hand to another
+        self._on_host = on_host  # NumPy arrays, which can be passed between processes
         self._places: list[tuple[int, int, tuple[str, ...], tuple[int, ...]]] = []
         if all(recording.num_frames < length for recording in recordings):
             longest = max((recording.num_frames for recording in recordings), default=0)
@@ -86,7 +86,7 @@ class _ClipSource:
                 f"No clip of {length} frames in {len(self._recordings)} recordings (the longest has {longest} frames). "
                 "Ask for shorter clips or give longer recordings."
             )
-        most_heard = 0.0
+        max_measured = 0.0
         for number, recording in enumerate(recordings):
             if recording.num_frames < length:
                 warnings.warn(
@@ -96,22 +96,22 @@ class _ClipSource:
                     stacklevel=3,
                 )
                 continue
-            named = selected_tags(recording, epcs)
-            chosen = choose_antennas(recording, named, settings["antennas"])
+            selected = selected_tags(recording, epcs)
+            chosen = choose_antennas(recording, selected, settings["antennas"])
             if settings["estimator"] == "truth":
-                for epc, antenna in itertools.product(named, chosen):
+                for epc, antenna in itertools.product(selected, chosen):
                     true_range_m(recording, epc, antenna)
             starts = range(0, recording.num_frames - length + 1, step)
-            heard = motion_heard(recording, starts, length, named, chosen)
-            for start, of_tags in zip(starts, heard, strict=True):
-                if of_tags.max() >= min_motion:
-                    drawn = _drawn_tags(of_tags, max_tags, (number, start))
-                    self._places.append((number, start, tuple(named[tag] for tag in drawn), chosen))
-            most_heard = max(most_heard, float(heard.max()))
+            motion = measured_motion(recording, starts, length, selected, chosen)
+            for start, tag_motion in zip(starts, motion, strict=True):
+                if tag_motion.max() >= min_motion:
+                    tags = _choose_tags(tag_motion, max_tags, (number, start))
+                    self._places.append((number, start, tuple(selected[tag] for tag in tags), chosen))
+            max_measured = max(max_measured, float(motion.max()))
         if not self._places:
             raise RecordingError(
-                f"In no clip of {length} frames is a tag heard to move by {min_motion} or more (the most is "
-                f"{most_heard:.3f}; noise alone makes about 0.02): there is nothing to learn motion from. Give recordings "
+                f"No clip of {length} frames has a tag whose reads show motion of {min_motion} or more (the maximum is "
+                f"{max_measured:.3f}; noise alone gives about 0.02): there is nothing to learn motion from. Give recordings "
                 "in which tags move and are read, or set data.clips.min_motion lower."
             )
 
@@ -120,7 +120,7 @@ class _ClipSource:
 
     def __getitem__(self, index) -> Clip:
         number, start, epcs, antennas = self._places[int(index)]
-        settings: dict[str, Any] = {**self._settings, "antennas": antennas}  # of all its tags, whichever were drawn
+        settings: dict[str, Any] = {**self._settings, "antennas": antennas}  # chosen from all tags of the recording
         clip = load_clip(self._recordings[number], start, start + self._length, epcs=epcs, **settings)
         return jax.tree.map(np.asarray, clip) if self._on_host else clip
 
@@ -146,17 +146,17 @@ def clip_dataset(
     min_motion: float = 0.0,
     max_tags: int | None = None,
     workers: int = 0,
-    share: tuple[int, int] = (0, 1),
+    shard: tuple[int, int] = (0, 1),
 ) -> Stream:
     """An endless, shuffled stream of clips; the same seed gives the same order.
 
     Its iterator's `get_state` and `set_state` resume exactly. Clips begin on multiples of `step` (half a clip if None);
-    those in which no tag is heard to move by `min_motion` (`motion_heard`) are not drawn, and of a clip's tags
-    `max_tags` are, all if None: the one that is heard to move most and some of the others, the same each time. With
-    `workers` as many processes load them, radio included, and this one only takes them to its device; `share` (i, n) is
+    clips in which the reads of no tag show motion of `min_motion` (`measured_motion`) are left out. A clip has
+    `max_tags` of its tags, all if None: the tag with the most motion and some of the others, always the same ones.
+    `workers` processes load the clips and compute their radio features; 0 does this in a thread. `shard` (i, n) takes
     every n-th clip from the i-th on. Warns (`RecordingWarning`) of recordings shorter than a clip; raises
-    `RecordingError` if all are, and for an unknown EPC or antenna of any other; `ValueError` for settings that no clip
-    can have.
+    `RecordingError` if all recordings are, and for an unknown EPC or antenna; `ValueError` for settings that no clip can
+    have.
     """
     check_clip(stride=stride, window=window, max_reads=max_reads)
     for name, found, unit in (
@@ -183,4 +183,4 @@ def clip_dataset(
         colour=colour,
     )
     dataset = grain.MapDataset.source(source).shuffle(seed=seed).repeat()
-    return Stream(dataset, workers=workers, shard=share, transform=_on_device if workers else None)
+    return Stream(dataset, workers=workers, shard=shard, transform=_on_device if workers else None)

@@ -10,7 +10,7 @@ from ..metrics.recordings import ScoreSettings
 from .joint import JointSettings
 from .logging import LoggerSettings
 from .loop import LoopSettings
-from .loss import ObjectiveSettings
+from .objective import ObjectiveSettings
 from .processes import DistributedSettings
 from .sources import DataSettings
 
@@ -21,18 +21,16 @@ class TrainConfig:
 
     tracer: Mapping[str, Any]
     optimizer: Mapping[str, Any]
-    weights: str | None = (
-        None  # learned parameters to begin with: `default`, a name, or a file (tagjax.tagattention.learned)
-    )
-    baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside it
+    weights: str | None = None  # initial learned parameters: `default`, a name, or a file (tagjax.tagattention.learned)
+    baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside the tracer
     baseline_estimators: Mapping[str, str] = dataclasses.field(
         default_factory=dict
-    )  # of a baseline, where not the clips'
+    )  # of a baseline, where it differs from the clips' estimator
     seed: int = 0
     clip_norm: float = 1.0
-    resume: bool = True  # from the run folder's newest checkpoint, if it holds one
+    resume: bool = True  # from the run folder's newest checkpoint, if there is one
     retune: bool = False  # a resumed run may have another clip_norm and other numbers of its optimiser
-    joint: JointSettings | None = None  # without it flow is `data.clips.flow`, computed once
+    joint: JointSettings | None = None  # None: the flow is `data.clips.flow`, computed once
     data: DataSettings = dataclasses.field(default_factory=DataSettings)
     objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
     loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)

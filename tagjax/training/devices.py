@@ -1,7 +1,7 @@
-"""Batches spread over devices, what learns copied to each: data parallelism by sharding.
+"""Data parallelism by sharding: batches are sharded over the devices, and states are replicated on each.
 
-`spread` and `copied` reach over the devices of all processes, for one program that all of them run; `spread_here` and
-`copied_here` over this process's own.
+`shard` and `replicate` use the devices of all processes, for one program that all of them run; `shard_locally` and
+`replicate_locally` use the devices of this process.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ T = TypeVar("T", bound=PyTree)
 AXIS = "data"
 
 
-def mesh_here() -> Mesh:
-    """This process's devices in a row."""
+def local_mesh() -> Mesh:
+    """A one-dimensional mesh of this process's devices."""
     return Mesh(np.asarray(jax.local_devices()), (AXIS,))
 
 
-def _mesh() -> Mesh:
+def _global_mesh() -> Mesh:
     return Mesh(np.asarray(jax.devices()), (AXIS,))
 
 
@@ -35,46 +35,46 @@ def check_batch(batch_size: int) -> None:
         raise ValueError(f"loop.batch_size is {batch_size}; on {count} devices it must be a multiple of {count}.")
 
 
-def spread(batch: T) -> T:
-    """Arrays with samples first, each device holding its share. What is computed of them is computed there.
+def shard(batch: T) -> T:
+    """Arrays with a leading sample axis, sharded over all devices; what follows from a sample is computed on its device.
 
-    Each process gives its own samples.
+    Each process passes its own samples.
     """
     if jax.device_count() == 1:
         return batch
-    sharding = NamedSharding(_mesh(), PartitionSpec(AXIS))
+    sharding = NamedSharding(_global_mesh(), PartitionSpec(AXIS))
     return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), batch)
 
 
-def copied(state: T) -> T:
-    """The arrays of a state, whole on every device; they must be the same in all processes."""
+def replicate(state: T) -> T:
+    """The arrays of a state, replicated on every device; they must be the same in all processes."""
     if jax.device_count() == 1:
         return state
-    sharding = NamedSharding(_mesh(), PartitionSpec())
-    arrays, rest = eqx.partition(state, eqx.is_array)
+    sharding = NamedSharding(_global_mesh(), PartitionSpec())
+    arrays, static = eqx.partition(state, eqx.is_array)
 
     def copy(leaf: jax.Array) -> jax.Array:
         if isinstance(leaf, jax.Array) and leaf.sharding == sharding:
             return leaf
         return jax.make_array_from_process_local_data(sharding, np.asarray(leaf))
 
-    return eqx.combine(jax.tree.map(copy, arrays), rest)
+    return eqx.combine(jax.tree.map(copy, arrays), static)
 
 
-def local(state: T) -> T:
-    """`copied` undone: the arrays on this process's first device, for what it computes by itself."""
+def unreplicate(state: T) -> T:
+    """The inverse of `replicate`: the arrays on this process's first device, for computations of this process alone."""
     if jax.device_count() == 1:
         return state
-    arrays, rest = eqx.partition(state, eqx.is_array)
-    return eqx.combine(jax.device_put(jax.tree.map(np.asarray, arrays), jax.local_devices()[0]), rest)
+    arrays, static = eqx.partition(state, eqx.is_array)
+    return eqx.combine(jax.device_put(jax.tree.map(np.asarray, arrays), jax.local_devices()[0]), static)
 
 
-def spread_here(batch: T) -> T:
-    """`spread` over this process's devices only."""
-    return jax.device_put(batch, NamedSharding(mesh_here(), PartitionSpec(AXIS)))
+def shard_locally(batch: T) -> T:
+    """Like `shard`, over this process's devices only."""
+    return jax.device_put(batch, NamedSharding(local_mesh(), PartitionSpec(AXIS)))
 
 
-def copied_here(state: T) -> T:
-    """`copied` to this process's devices only."""
-    arrays, rest = eqx.partition(state, eqx.is_array)
-    return eqx.combine(jax.device_put(arrays, NamedSharding(mesh_here(), PartitionSpec())), rest)
+def replicate_locally(state: T) -> T:
+    """Like `replicate`, on this process's devices only."""
+    arrays, static = eqx.partition(state, eqx.is_array)
+    return eqx.combine(jax.device_put(arrays, NamedSharding(local_mesh(), PartitionSpec())), static)

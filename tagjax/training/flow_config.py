@@ -20,12 +20,12 @@ class TrainFlowConfig:
 
     flow: Mapping[str, Any]
     optimizer: Mapping[str, Any]
-    weights: str | None = None  # to begin with: `default` or a file; random ones if None
+    weights: str | None = None  # initial weights: `default` or a file; random if None
     seed: int = 0
     clip_norm: float = 1.0
-    average_over: int = 500  # steps that the kept weights are a running average of
+    average_over: int = 500  # steps over which the weights are averaged; the average is what is saved
     matmul_precision: Literal["bfloat16", "tensorfloat32", "float32"] | None = (
-        None  # of products; None is JAX's default
+        None  # of matrix products; None is JAX's default
     )
     resume: bool = True
     retune: bool = False

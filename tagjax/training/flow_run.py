@@ -1,4 +1,4 @@
-"""A whole run of flow training in a folder: pictures in; checkpoints, logs, weights and scores out."""
+"""A whole run of flow training in a folder: its inputs are images, its outputs checkpoints, logs, weights and scores."""
 
 from __future__ import annotations
 
@@ -28,43 +28,45 @@ from ..flow.weights import load_weights, save_weights
 from ..metrics.flow import FlowScores
 from ..sim.flow_pairs import FlowPair
 from .checkpoint import Checkpoints
-from .devices import check_batch, local
+from .devices import check_batch, unreplicate
 from .flow_config import TrainFlowConfig
 from .flow_sources import flow_dataset, installed_photographs, validation_pairs
 from .flow_step import FlowTrainState, flow_step
 from .logging import Logger
-from .loop import resumed, train
-from .processes import is_first, joined
+from .loop import resume_state, train
+from .processes import distributed_runtime, is_first
 from .step import make_optimizer
 
 _PEERS = ("zero", "dis_ultrafast", "dis_fast", "dis")
 _MOVING_PX = 0.5
 _WARPED_PAIRS = 8
-"""Of each sequence, spread over it."""
+"""Number of pairs, evenly spaced in time, of each sequence."""
 
 
 def make_network(settings: Mapping[str, Any]) -> AbstractFlowNetwork:
-    """The flow network that the settings name. Raises `ValueError` if they name something else."""
+    """The flow network of the settings. Raises `ValueError` if `_target_` is not a flow network."""
     network = build(settings, where="flow")
     if not isinstance(network, AbstractFlowNetwork):
-        raise ValueError(f"flow: {settings['_target_']} is no network that learns; choose flow=pyramid, for example.")
+        raise ValueError(
+            f"flow: {settings['_target_']} is not a network that can be trained; choose one, for example flow=pyramid."
+        )
     return network
 
 
 def initial_network(settings: Mapping[str, Any], weights: str | None) -> AbstractFlowNetwork:
-    """The network that the settings name, with the weights to begin with. Errors as of `make_network`, `load_weights`."""
+    """The network of the settings, with its initial weights. Raises the errors of `make_network`, `load_weights`."""
     network = make_network(settings)
     return network if weights is None else load_weights(network, weights)
 
 
 def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console | None = None) -> float:
-    """Train as configured and return the mean end-point error on drawn validation pairs, pixels; NaN if interrupted.
+    """Train as configured and return the mean end-point error on synthetic validation pairs, pixels; NaN if interrupted.
 
     `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.safetensors, which `data.clips.flow=<path>` uses. An
-    interrupted run goes on from its newest checkpoint when started again in the same folder. Of several processes
-    (`config.distributed`) only the first writes.
+    interrupted run resumes from its newest checkpoint when started again in the same folder. With several processes
+    (`config.distributed`) only process 0 writes.
     """
-    with joined(config.distributed):
+    with distributed_runtime(config.distributed):
         return _run(config, folder, console or Console(quiet=not is_first()))
 
 
@@ -75,20 +77,20 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     check_batch(config.loop.batch_size)
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
     state = FlowTrainState.create(network, optimizer, seed=config.seed)
-    share = jax.process_index(), jax.process_count()
-    samples = iter(flow_dataset(config.data, seed=config.seed, progress=config.loop.progress, share=share))
+    shard = jax.process_index(), jax.process_count()
+    samples = iter(flow_dataset(config.data, seed=config.seed, progress=config.loop.progress, shard=shard))
     held_out = validation_pairs(config.data.drawn)
-    peers = {name: scores(flow_of_peer(name, held_out), held_out) for name in _PEERS}
+    peers = {name: scores(flow_by_name(name, held_out), held_out) for name in _PEERS}
     with Checkpoints(folder / "checkpoints") as checkpoints:
-        state = resumed(state, samples, checkpoints, allowed=config.resume)
+        state = resume_state(state, samples, checkpoints, allowed=config.resume)
         first_step = int(state.step)
         if first_step:
             console.print(f"Resumed at step {first_step} of {config.loop.num_steps}.")
         logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=first_step)
 
         def validate(state: FlowTrainState) -> dict[str, float]:
-            found = scores(flow_of(local(state.average), held_out), held_out)
-            return {f"epe_{name}": value for name, value in found.items()}
+            errors_px = scores(predict_flow(unreplicate(state.average), held_out), held_out)
+            return {f"epe_{name}": value for name, value in errors_px.items()}
 
         try:
             with jax.default_matmul_precision(config.matmul_precision):
@@ -102,25 +104,25 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
                     logger=logger,
                     checkpoints=checkpoints,
                     validate=validate,
-                    shown=("loss", "data", "occluded_fraction") if config.data.teacher is None else ("loss",),
+                    displayed=("loss", "data", "occluded_fraction") if config.data.teacher is None else ("loss",),
                 )
         finally:
             logger.close()
             samples.close()
-    learned = local(trained.state.average)
-    found = {"learned": scores(flow_of(learned, held_out), held_out), **peers}
+    learned = unreplicate(trained.state.average)
+    errors_px = {"learned": scores(predict_flow(learned, held_out), held_out), **peers}
     steps = int(trained.state.step)
     warped = _warped(config, learned) if is_first() else {}
     summary = {
         "steps": steps,
-        "epe_px": found,
+        "epe_px": errors_px,
         **({"warped_levels": warped} if warped else {}),
         "steps_in_this_call": steps - first_step,
         "elapsed_s_in_this_call": round(time.perf_counter() - begun, 1),
         "machine": machine(),
     }
     if not is_first():
-        return float("nan") if trained.interrupted else found["learned"]["all"]
+        return float("nan") if trained.interrupted else errors_px["learned"]["all"]
     write_json(folder / "metrics.json", summary)
     about = {
         "flow": dict(config.flow),
@@ -129,14 +131,14 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
         **summary,
     }
     save_weights(folder / "weights.safetensors", learned, about)
-    console.print(_table(found))
+    console.print(_table(errors_px))
     if warped:
-        told = ", ".join(f"{name} {levels:.2f}" for name, levels in warped.items())
-        console.print(f"what is left of the sequences' pictures by warping, grey levels of 255: {told}")
+        values = ", ".join(f"{name} {levels:.2f}" for name, levels in warped.items())
+        console.print(f"mean difference of the sequences' images after warping, grey levels of 255: {values}")
     if trained.interrupted:
-        console.print(f"Stopped at step {steps}; go on with the same command and hydra.run.dir={folder}")
+        console.print(f"Stopped at step {steps}; resume with the same command and hydra.run.dir={folder}")
         return float("nan")
-    return found["learned"]["all"]
+    return errors_px["learned"]["all"]
 
 
 def _check_sizes(network: AbstractFlowNetwork, variation: AugmentationSettings, loss: FlowLossSettings) -> None:
@@ -145,7 +147,7 @@ def _check_sizes(network: AbstractFlowNetwork, variation: AugmentationSettings, 
         if value % network.divisor:
             fitting = network.divisor * max(1, round(value / network.divisor))
             raise ValueError(
-                f"data.variation.{name} is {value}; this network takes multiples of {network.divisor}: set {fitting}."
+                f"data.variation.{name} is {value}; this network needs multiples of {network.divisor}: set {fitting}."
             )
     if loss.self_supervision == 0:
         return
@@ -155,7 +157,7 @@ def _check_sizes(network: AbstractFlowNetwork, variation: AugmentationSettings, 
         if left < network.divisor or left % network.divisor:
             raise ValueError(
                 f"loss.self_supervision_border_px is {border}, which leaves {left} pixels of data.variation.{name}; this "
-                f"network takes multiples of {network.divisor}, at least one: set a multiple of {half}, or a greater {name}."
+                f"network needs multiples of {network.divisor}, at least one: set a multiple of {half}, or a greater {name}."
             )
 
 
@@ -164,7 +166,7 @@ def _flows(network: AbstractFlowNetwork, first: jax.Array, second: jax.Array) ->
     return jax.vmap(functools.partial(forward_flow, network))(first, second)
 
 
-def flow_of(network: AbstractFlowNetwork, pairs: FlowPair, batch: int = 8) -> np.ndarray:
+def predict_flow(network: AbstractFlowNetwork, pairs: FlowPair, batch: int = 8) -> np.ndarray:
     """The network's flow of stacked pairs of any size, first to second."""
     count = pairs.first.shape[0]
     parts = [
@@ -174,15 +176,15 @@ def flow_of(network: AbstractFlowNetwork, pairs: FlowPair, batch: int = 8) -> np
     return np.concatenate(parts)
 
 
-def flow_of_peer(name: str, pairs: FlowPair) -> np.ndarray:
-    """The flow of stacked pairs by a flow of that name (`tagjax.flow.registry`)."""
+def flow_by_name(name: str, pairs: FlowPair) -> np.ndarray:
+    """The flow of stacked pairs, estimated by the flow of this name (`tagjax.flow.registry`)."""
     flow = make_flow(name)
     first, second = (np.rint(255 * np.asarray(pictures)).astype(np.uint8) for pictures in (pairs.first, pairs.second))
     return np.stack([flow(a, b) for a, b in zip(first, second, strict=True)])
 
 
 def scores(flow_px: np.ndarray, pairs: FlowPair) -> dict[str, float]:
-    """Mean end-point error, pixels: of all pixels, visible ones, hidden ones, and those that move."""
+    """Mean end-point error, pixels: over all pixels, the visible ones, the hidden ones, and the moving ones."""
     truth, hidden = np.asarray(pairs.forward_px), np.asarray(pairs.occluded_first)
     error = np.linalg.norm(flow_px - truth, axis=-1)
     moving = np.linalg.norm(truth, axis=-1) > _MOVING_PX
@@ -191,10 +193,10 @@ def scores(flow_px: np.ndarray, pairs: FlowPair) -> dict[str, float]:
 
 
 def _warped(config: TrainFlowConfig, learned: AbstractFlowNetwork) -> dict[str, float]:
-    """Mean difference of pictures of the sequences when the next is warped onto them, grey levels; by network and peers.
+    """Mean difference between images of the sequences and the next image warped onto them, grey levels; by flow.
 
-    The pictures were learned from as well, without a label. `before` are the weights that were begun with, if any were
-    given. Empty without sequences.
+    The images are also training data, which is used without labels. `before` stands for the initial weights, where they
+    were given. Empty without sequences.
     """
     if not config.data.sequences:
         return {}
@@ -208,12 +210,12 @@ def _warped(config: TrainFlowConfig, learned: AbstractFlowNetwork) -> dict[str, 
             first, second = np.asarray(pictures[t]), np.asarray(pictures[t + 1])
             for name, flow in flows.items():
                 total[name] = total[name].merge(FlowScores.of_pictures(first, second, flow(first, second)))
-    told = {name: score.result()["warped_levels"] for name, score in total.items()}
-    return {name: float(levels) for name, levels in told.items() if levels is not None}
+    results = {name: score.result()["warped_levels"] for name, score in total.items()}
+    return {name: float(levels) for name, levels in results.items() if levels is not None}
 
 
-def _table(found: Mapping[str, Mapping[str, float]]) -> Table:
-    table = Table("flow", *next(iter(found.values())), title="end-point error on drawn validation pairs, px")
-    for name, values in found.items():
+def _table(errors_px: Mapping[str, Mapping[str, float]]) -> Table:
+    table = Table("flow", *next(iter(errors_px.values())), title="end-point error on synthetic validation pairs, px")
+    for name, values in errors_px.items():
         table.add_row(name, *(f"{value:.3f}" for value in values.values()))
     return table

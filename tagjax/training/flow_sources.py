@@ -1,4 +1,4 @@
-"""Pictures for flow training: drawn pairs, made once and kept, and the sequences that a user names."""
+"""Images for flow training: synthetic pairs, rendered once and cached, and the user's sequences."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..flow.image_pairs import PairSource, StackedPairs, TeacherPairs, pair_data
 from ..flow.image_sequences import open_sequence
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.rendering.textures import PHOTOGRAPHS, photograph
-from .flow_teacher import cut_pairs, taught_flow
+from .flow_teacher import cut_pairs, teacher_flow
 
 _BATCH = 16
 _SHARD = 128
@@ -33,50 +33,54 @@ _VALIDATION_SEED = 1_000_003
 
 @dataclasses.dataclass(frozen=True)
 class DrawnSettings:
-    """The drawn pairs: how many, and what they show. They are made once and kept under `folder`."""
+    """The synthetic pairs: how many, and their content. They are rendered once and cached under `folder`."""
 
     num_pairs: int = 4096
     num_validation: int = 64
     seed: int = 0
-    photographs: bool = True  # those of installed packages; which they are is part of the pairs' name
+    photographs: bool = True  # those of installed packages; their names are part of the cache key
     folder: str = "recordings"
     pairs: FlowPairSettings = dataclasses.field(default_factory=FlowPairSettings)
 
     def __post_init__(self) -> None:
-        for name, least in (("num_pairs", 0), ("num_validation", _BATCH)):
-            found = getattr(self, name)
-            if found % _BATCH or found < least:
-                raise ValueError(f"{name} is {found}; expected a multiple of {_BATCH}, {least} or more.")
+        for name, minimum in (("num_pairs", 0), ("num_validation", _BATCH)):
+            value = getattr(self, name)
+            if value % _BATCH or value < minimum:
+                raise ValueError(f"{name} is {value}; expected a multiple of {_BATCH}, {minimum} or more.")
 
 
 @dataclasses.dataclass(frozen=True)
 class FlowDataSettings:
-    """What flow is learned from, and how pairs are cut and varied."""
+    """The training data of a flow network, and how pairs are cropped and augmented."""
 
     drawn: DrawnSettings = dataclasses.field(default_factory=DrawnSettings)
-    sequences: tuple[str, ...] = ()  # recordings, videos, folders of pictures: never labelled
-    sequence_fraction: float = 0.5  # of the samples, all sequences together; the rest is drawn
+    sequences: tuple[str, ...] = ()  # recordings, videos, folders of images; used without labels
+    sequence_fraction: float = 0.5  # fraction of the samples that is from sequences; the others are synthetic
     variation: AugmentationSettings = dataclasses.field(default_factory=AugmentationSettings)
-    teacher: str | None = None  # a flow by name, whose word is all that is learned from
-    cuts_per_sequence: int = 24  # pairs of the drawn ones' size that the teacher is asked for
-    workers: int = 0  # processes that read and vary pairs
+    teacher: str | None = None  # a flow by name; its estimates are then the only training signal
+    cuts_per_sequence: int = 24  # pairs of the synthetic pairs' size for which the teacher estimates the flow
+    workers: int = 0  # processes that read and augment pairs
 
     def __post_init__(self) -> None:
         if self.cuts_per_sequence < 1:
             raise ValueError(f"cuts_per_sequence is {self.cuts_per_sequence}; expected at least 1.")
         if not 0 < self.sequence_fraction <= 1:
-            raise ValueError(f"sequence_fraction is {self.sequence_fraction}; expected a share above 0 and at most 1.")
+            raise ValueError(
+                f"sequence_fraction is {self.sequence_fraction}; expected a fraction above 0 and at most 1."
+            )
         if self.drawn.num_pairs < 1 and not self.sequences:
-            raise ValueError("Nothing to learn from: drawn.num_pairs is 0 and no sequences are named.")
+            raise ValueError(
+                "Nothing to learn from: found drawn.num_pairs=0 and no sequences; expected one of the two."
+            )
 
 
 def installed_photographs() -> list[str]:
-    """Names of the photographs that installed packages bring."""
+    """Names of the photographs that installed packages contain."""
     return [name for name in PHOTOGRAPHS if photograph(name) is not None]
 
 
 def photograph_stack(names: Sequence[str], seed: int) -> UInt8[np.ndarray, "count 240 320 3"] | None:
-    """Cuts of the named photographs at random scales; None without any name."""
+    """Crops of these photographs at random scales; None without any name."""
     rng = np.random.default_rng(seed)
     height, width = _PHOTO_SHAPE
     cuts = []
@@ -84,9 +88,9 @@ def photograph_stack(names: Sequence[str], seed: int) -> UInt8[np.ndarray, "coun
         levels = photograph(name)
         assert levels is not None
         picture = (255 * levels[0] ** np.float32(1 / 2.2)).astype(np.uint8)
-        least = max(height / picture.shape[0], width / picture.shape[1])
+        min_scale = max(height / picture.shape[0], width / picture.shape[1])
         for _ in range(_CUTS_OF_A_PHOTO):
-            scale = least * rng.uniform(1.0, 1.6)
+            scale = min_scale * rng.uniform(1.0, 1.6)
             size = (max(width, round(picture.shape[1] * scale)), max(height, round(picture.shape[0] * scale)))
             resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
             top, left = rng.integers(0, size[1] - height + 1), rng.integers(0, size[0] - width + 1)
@@ -99,7 +103,7 @@ def _photographs(settings: DrawnSettings) -> UInt8[np.ndarray, "count 240 320 3"
 
 
 def drawn_pairs(settings: DrawnSettings, *, progress: bool = True) -> LazyArray:
-    """The drawn pairs (pair, 2, height, width, 3), uint8, of the folder; drawn if they are not there yet."""
+    """The drawn pairs (pair, 2, height, width, 3), uint8; rendered if they are not cached yet."""
     about = {**dataclasses.asdict(settings), "photographs": installed_photographs() if settings.photographs else []}
     del about["folder"], about["num_validation"]
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
@@ -121,7 +125,7 @@ def _draw(settings: DrawnSettings, path: Path, about: dict, progress: bool) -> N
         dtype="uint8",
         shard=_SHARD,
         attributes={"about": about},
-        description="draw flow pairs",
+        description="render flow pairs",
         progress=progress,
     )
 
@@ -132,25 +136,25 @@ def _batch(settings: DrawnSettings, photos: np.ndarray | None, seed: int, start:
 
 
 def to_bytes(pairs: FlowPair) -> UInt8[np.ndarray, "pair 2 height width 3"]:
-    """Both pictures of stacked pairs as bytes."""
+    """Both images of stacked pairs as bytes."""
     both = np.stack([np.asarray(pairs.first), np.asarray(pairs.second)], axis=1)
     return np.rint(255 * both).astype(np.uint8)
 
 
 def validation_pairs(settings: DrawnSettings) -> FlowPair:
-    """Drawn pairs with their flow, of another seed than any for training, whatever that is."""
+    """Synthetic pairs with their flow; their seed is never used for training."""
     photos = _photographs(settings)
     parts = [_batch(settings, photos, _VALIDATION_SEED, start) for start in range(0, settings.num_validation, _BATCH)]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 def flow_dataset(
-    settings: FlowDataSettings, *, seed: int, progress: bool = True, share: tuple[int, int] = (0, 1)
+    settings: FlowDataSettings, *, seed: int, progress: bool = True, shard: tuple[int, int] = (0, 1)
 ) -> Stream:
-    """The endless stream of varied pairs that the settings describe, or a share of it; with the teacher's flow, if any."""
+    """The endless stream of augmented pairs that the settings describe, or a shard of it; with the teacher's flow, if any."""
     sequences = [open_sequence(path, Path(settings.drawn.folder)) for path in settings.sequences]
     lengths = [sequence.shape[0] for sequence in sequences]
-    whole = settings.sequence_fraction if settings.drawn.num_pairs else 1.0
+    sequences_weight = settings.sequence_fraction if settings.drawn.num_pairs else 1.0
     sources: list[PairSource | StackedPairs | TeacherPairs] = []
     for number, sequence in enumerate(sequences):
         if settings.teacher is None:
@@ -158,16 +162,20 @@ def flow_dataset(
             continue
         size = settings.drawn.pairs.height, settings.drawn.pairs.width
         cuts = cut_pairs(sequence, settings.cuts_per_sequence, size, settings.variation.gaps, seed=seed + number)
-        sources.append(_taught(cuts, settings, settings.teacher, progress))
-    shares = [whole * length / sum(lengths) for length in lengths]
-    if (settings.drawn.num_pairs and whole < 1) or not sources:
+        sources.append(_with_teacher(cuts, settings, settings.teacher, progress))
+    weights = [sequences_weight * length / sum(lengths) for length in lengths]
+    if (settings.drawn.num_pairs and sequences_weight < 1) or not sources:
         pairs = drawn_pairs(settings.drawn, progress=progress)
         sources.append(
-            StackedPairs(pairs) if settings.teacher is None else _taught(pairs, settings, settings.teacher, progress)
+            StackedPairs(pairs)
+            if settings.teacher is None
+            else _with_teacher(pairs, settings, settings.teacher, progress)
         )
-        shares.append(1 - whole if sequences else 1.0)
-    return pair_dataset(sources, shares, settings.variation, seed=seed, workers=settings.workers, shard=share)
+        weights.append(1 - sequences_weight if sequences else 1.0)
+    return pair_dataset(sources, weights, settings.variation, seed=seed, workers=settings.workers, shard=shard)
 
 
-def _taught(pairs: LazyArray | np.ndarray, settings: FlowDataSettings, teacher: str, progress: bool) -> TeacherPairs:
-    return TeacherPairs(pairs, taught_flow(pairs, teacher, Path(settings.drawn.folder), progress=progress))
+def _with_teacher(
+    pairs: LazyArray | np.ndarray, settings: FlowDataSettings, teacher: str, progress: bool
+) -> TeacherPairs:
+    return TeacherPairs(pairs, teacher_flow(pairs, teacher, Path(settings.drawn.folder), progress=progress))

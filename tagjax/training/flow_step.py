@@ -15,11 +15,11 @@ from ..core.compilation import large_program
 from ..flow.loss_terms import crop_margin_px, occluded, self_supervision_term
 from ..flow.losses import FlowLossSettings, distillation_term, level_terms, sequence_terms, total_loss
 from ..flow.network import AbstractFlowNetwork, Levels, flow_both_ways
-from .devices import check_batch, copied, spread
+from .devices import check_batch, replicate, shard
 
 
 class FlowTrainState(eqx.Module):
-    """Network, the running average of its weights (which is what is kept), optimiser state, and steps done."""
+    """Network, the running average of its weights (which is saved), optimiser state, and number of steps done."""
 
     network: AbstractFlowNetwork
     average: AbstractFlowNetwork
@@ -40,22 +40,22 @@ class FlowTrainState(eqx.Module):
 def pair_terms(
     network: AbstractFlowNetwork,
     clean: Float[Array, "2 rows columns 3"],
-    seen: Float[Array, "2 height width 3"],
-    hide: Float[Array, ""],
+    augmented: Float[Array, "2 height width 3"],
+    mask_occluded: Float[Array, ""],
     settings: FlowLossSettings,
     *,
-    teach: bool,
+    self_supervise: bool,
 ) -> dict[str, Float[Array, ""]]:
-    """Terms of the loss of one pair, both ways: flow from the varied pictures, held against the clean ones.
+    """Terms of the loss of one pair, in both directions: flow of the augmented images, evaluated on the clean images.
 
-    The clean pictures may reach beyond the varied ones, alike at every side.
+    The clean images may extend beyond the augmented ones by the same margin at every side.
     """
-    forward, backward = flow_both_ways(network, seen[0], seen[1])
-    terms = terms_both_ways(forward, backward, clean, seen.shape[1:3], hide, settings)
-    if not teach:
+    forward, backward = flow_both_ways(network, augmented[0], augmented[1])
+    terms = terms_both_ways(forward, backward, clean, augmented.shape[1:3], mask_occluded, settings)
+    if not self_supervise:
         return {**terms, "self_supervision": jnp.zeros(())}
     border = settings.self_supervision_border_px
-    small = seen[:, border:-border, border:-border]
+    small = augmented[:, border:-border, border:-border]
     there, back = flow_both_ways(network, small[0], small[1])
     parts = [
         self_supervision_term(
@@ -71,51 +71,51 @@ def terms_both_ways(
     backward: Levels,
     clean: Float[Array, "2 rows columns 3"],
     size: tuple[int, ...],
-    hide: Float[Array, ""],
+    mask_occluded: Float[Array, ""],
     settings: FlowLossSettings,
 ) -> dict[str, Float[Array, ""]]:
-    """Terms of estimates for the middle of two pictures, a part of (height, width) `size`; the mean of both ways."""
+    """Terms for flow of the central (height, width) `size` part of two images; the mean of both directions."""
     margin, (height, width) = crop_margin_px(size, clean.shape[1:3]), size
     middle = clean[:, margin : margin + height, margin : margin + width]
     terms_of = sequence_terms if settings.sequence_decay > 0 else level_terms
     # Mapped, not written twice: less to compile.
     ways = [jax.tree.map(lambda *way: jnp.stack(way), *order) for order in ((forward, backward), (backward, forward))]
-    both = jax.vmap(lambda there, back, here, other: terms_of(there, back, here, other, hide, settings))
+    both = jax.vmap(lambda there, back, here, other: terms_of(there, back, here, other, mask_occluded, settings))
     return jax.tree.map(jnp.mean, both(ways[0], ways[1], middle, clean[::-1]))
 
 
 def batch_loss(
     network: AbstractFlowNetwork,
     clean: Float[Array, "batch 2 rows columns 3"],
-    seen: Float[Array, "batch 2 height width 3"],
+    augmented: Float[Array, "batch 2 height width 3"],
     step: Int[Array, ""],
     settings: FlowLossSettings,
     *,
-    teach: bool,
+    self_supervise: bool,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Mean loss over a batch, and its terms. Pictures are 0 to 1; `teach` once the teacher has begun."""
-    hide = (step >= settings.occlusion_after).astype(jnp.float32)
-    one = jax.vmap(lambda c, s: pair_terms(network, c, s, hide, settings, teach=teach))
-    found = jax.tree.map(jnp.mean, one(clean, seen))
+    """Mean loss over a batch, and its terms. Pictures are in [0, 1]; `self_supervise` adds the self-supervision term."""
+    mask_occluded = (step >= settings.occlusion_after).astype(jnp.float32)
+    one = jax.vmap(lambda c, s: pair_terms(network, c, s, mask_occluded, settings, self_supervise=self_supervise))
+    terms = jax.tree.map(jnp.mean, one(clean, augmented))
     begun = (step - settings.self_supervision_after).astype(jnp.float32)
     ramp = jnp.clip(begun / max(settings.self_supervision_ramp, 1), 0.0, 1.0)
-    found["self_supervision"] = ramp * found["self_supervision"]
-    return total_loss(found, settings), found
+    terms["self_supervision"] = ramp * terms["self_supervision"]
+    return total_loss(terms, settings), terms
 
 
-def imitation_loss(
+def distillation_loss(
     network: AbstractFlowNetwork,
-    seen: Float[Array, "batch 2 height width 3"],
+    augmented: Float[Array, "batch 2 height width 3"],
     teacher_px: Float[Array, "batch height width 2"],
     settings: FlowLossSettings,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Mean over a batch of `distillation_term`, first to second picture; it is the whole loss of a student."""
+    """Mean over a batch of `distillation_term`, first to second image: the whole loss of a student network."""
 
     def one(pair: Array, flow_px: Array) -> Array:
         return distillation_term(network.decode(network.encode(pair[0]), network.encode(pair[1])), flow_px, settings)
 
-    value = jnp.mean(jax.vmap(one)(seen, teacher_px))
-    return value, {"imitation": value}
+    value = jnp.mean(jax.vmap(one)(augmented, teacher_px))
+    return value, {"distillation": value}
 
 
 @large_program(level=1, donate="all-except-first")
@@ -125,16 +125,16 @@ def _update(
     optimizer: optax.GradientTransformation,
     settings: FlowLossSettings,
     average_over: float,
-    teach: bool,
+    self_supervise: bool,
 ) -> tuple[FlowTrainState, dict[str, Array]]:
-    clean, seen = (samples[name].astype(jnp.float32) / 255 for name in ("clean", "augmented"))
-    learnable, rest = eqx.partition(state.network, eqx.is_inexact_array)
+    clean, augmented = (samples[name].astype(jnp.float32) / 255 for name in ("clean", "augmented"))
+    learnable, static = eqx.partition(state.network, eqx.is_inexact_array)
 
     def loss(learnable: PyTree) -> tuple[Array, dict[str, Array]]:
-        network = eqx.combine(learnable, rest)
+        network = eqx.combine(learnable, static)
         if "flow_px" in samples:
-            return imitation_loss(network, seen, samples["flow_px"], settings)
-        return batch_loss(network, clean, seen, state.step, settings, teach=teach)
+            return distillation_loss(network, augmented, samples["flow_px"], settings)
+        return batch_loss(network, clean, augmented, state.step, settings, self_supervise=self_supervise)
 
     (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(learnable)
     norm = optax.tree.norm(gradient)
@@ -144,14 +144,14 @@ def _update(
         updates, optimizer_state = optimizer.update(safe, state.optimizer_state, learnable)
     keep = lambda new, old: jnp.where(usable, new, old)  # noqa: E731
     learnt = jax.tree.map(keep, optax.apply_updates(learnable, updates), learnable)
-    # The average begins as the mean of all steps, so that the first weights are soon forgotten.
+    # The average starts as the mean of all steps, so that the influence of the first weights decays quickly.
     done = state.step.astype(jnp.float32)
-    share = jnp.maximum(1 / average_over, 1 / (done + 1))
+    weight = jnp.maximum(1 / average_over, 1 / (done + 1))
     averaged, _ = eqx.partition(state.average, eqx.is_inexact_array)
-    averaged = jax.tree.map(lambda a, b: a + share * (b - a), averaged, learnt)
+    averaged = jax.tree.map(lambda a, b: a + weight * (b - a), averaged, learnt)
     after = FlowTrainState(
-        eqx.combine(learnt, rest),
-        eqx.combine(averaged, rest),
+        eqx.combine(learnt, static),
+        eqx.combine(averaged, static),
         jax.tree.map(keep, optimizer_state, state.optimizer_state),
         state.step + 1,
         state.key,
@@ -167,17 +167,18 @@ def flow_step(
     settings: FlowLossSettings,
     average_over: float,
 ) -> tuple[FlowTrainState, dict[str, float]]:
-    """One update on a batch of `vary`'s pairs: towards the teacher's flow where they have it.
+    """One update on a batch of augmented pairs: by distillation where they hold a teacher's flow.
 
-    A loss or gradient that is not finite changes nothing but the count.
+    A loss or gradient that is not finite changes nothing but the step count.
 
-    All devices share the batch, whose size must be a multiple of theirs; of several processes each gives its share.
+    The batch is sharded over all devices, and its size must be a multiple of their number; each process passes its own
+    part.
     """
     if not samples:
         raise ValueError("A training step needs at least one pair.")
     check_batch(len(samples) * jax.process_count())
-    batch = {name: spread(jnp.asarray(np.stack([sample[name] for sample in samples]))) for name in samples[0]}
+    batch = {name: shard(jnp.asarray(np.stack([sample[name] for sample in samples]))) for name in samples[0]}
     # Chosen here, not by a condition on the device: inside one, XLA's CPU backend takes ten times as long a step.
-    teach = settings.self_supervision > 0 and int(state.step) > settings.self_supervision_after
-    state, numbers = _update(batch, copied(state), optimizer, settings, average_over, teach)
+    self_supervise = settings.self_supervision > 0 and int(state.step) > settings.self_supervision_after
+    state, numbers = _update(batch, replicate(state), optimizer, settings, average_over, self_supervise)
     return state, {name: float(value) for name, value in numbers.items()}

@@ -1,6 +1,6 @@
-"""A teacher's flow of stacked pairs, made once and kept, for a student that learns from nothing else.
+"""A teacher's flow of stacked pairs, estimated once and cached, as the only training signal of a student network.
 
-The teacher is any flow by name, slow and exact for example; the student, a network that runs at video rate.
+The teacher is any flow by name, for example a slow and accurate one; the student is a network that runs at video rate.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from ..flow.registry import flow_key, make_flow
 from ..recording import RecordingError
 
 _SHARD = 64
-_LOOKS = 4
-"""Places that are looked at for each cut: the one where most changes is taken, since mostly nothing moves."""
+_NUM_CANDIDATES = 4
+"""Candidate positions for each crop: the one with the largest change is taken, because most of an image is static."""
 
 
 def cut_pairs(
     sequence: LazyArray, count: int, size: tuple[int, int], gaps: Sequence[int], *, seed: int
 ) -> UInt8[np.ndarray, "count 2 height width 3"]:
-    """`count` cuts of (height, width) `size` from random pairs of a sequence's pictures that are one of `gaps` apart.
+    """`count` crops of (height, width) `size` from random pairs of a sequence's images that are one of `gaps` frames apart.
 
-    Raises `RecordingError` for pictures smaller than that, and for too few.
+    Raises `RecordingError` if the images are smaller than `size` or too few.
     """
     pictures, height, width, _ = sequence.shape
     rows, columns = size
@@ -36,35 +36,38 @@ def cut_pairs(
             f"Pictures of {width} x {height} pixels; cuts for a student take {columns} x {rows}. "
             "Make data.drawn.pairs.height and width smaller."
         )
-    near = [gap for gap in gaps if gap < pictures]
-    if not near:
+    possible = [gap for gap in gaps if gap < pictures]
+    if not possible:
         raise RecordingError(f"No two of {pictures} pictures are {' or '.join(map(str, gaps))} frames apart.")
     rng = np.random.default_rng(seed)
     cuts = []
     for _ in range(count):
-        gap = int(rng.choice(near))
+        gap = int(rng.choice(possible))
         frame = int(rng.integers(0, pictures - gap))
         both = np.stack([np.asarray(sequence[frame]), np.asarray(sequence[frame + gap])])
         places = zip(
-            rng.integers(0, height - rows + 1, _LOOKS), rng.integers(0, width - columns + 1, _LOOKS), strict=True
+            rng.integers(0, height - rows + 1, _NUM_CANDIDATES),
+            rng.integers(0, width - columns + 1, _NUM_CANDIDATES),
+            strict=True,
         )
-        looks = [both[:, top : top + rows, left : left + columns] for top, left in places]
-        cuts.append(max(looks, key=lambda look: float(np.mean(np.abs(look[0].astype(np.float32) - look[1])))))
+        candidates = [both[:, top : top + rows, left : left + columns] for top, left in places]
+        cuts.append(max(candidates, key=lambda crop: float(np.mean(np.abs(crop[0].astype(np.float32) - crop[1])))))
     return np.stack(cuts)
 
 
-def taught_flow(
+def teacher_flow(
     pairs: LazyArray | UInt8[np.ndarray, "pair 2 height width 3"], teacher: str, folder: Path, *, progress: bool = True
 ) -> LazyArray:
-    """The teacher's flow (pair, height, width, 2) from first to second picture of each pair, half precision.
+    """The teacher's flow (pair, height, width, 2) from the first to the second image of each pair, half precision.
 
-    Made once and kept in `folder`, under the digest of the pairs and the teacher's key. Errors as of `make_flow`.
+    Estimated once and cached in `folder`, under the digest of the pairs and the teacher's key. Raises the errors of
+    `make_flow`.
     """
     target = folder / f"flow-of-{_digest(pairs)}-{flow_key(teacher)}.zarr"
-    return cached_array(target, lambda path: _teach(pairs, teacher, path, progress))
+    return cached_array(target, lambda path: _write_teacher_flow(pairs, teacher, path, progress))
 
 
-def _teach(pairs: LazyArray | np.ndarray, teacher: str, path: Path, progress: bool) -> None:
+def _write_teacher_flow(pairs: LazyArray | np.ndarray, teacher: str, path: Path, progress: bool) -> None:
     flow = make_flow(teacher)
     count, _, height, width, _ = pairs.shape
 
@@ -86,7 +89,7 @@ def _teach(pairs: LazyArray | np.ndarray, teacher: str, path: Path, progress: bo
 
 
 def _digest(pairs: LazyArray | np.ndarray) -> str:
-    found = hashlib.sha256(repr(tuple(pairs.shape)).encode())
+    digest = hashlib.sha256(repr(tuple(pairs.shape)).encode())
     for start in range(0, pairs.shape[0], _SHARD):
-        found.update(np.ascontiguousarray(pairs[start : start + _SHARD]).tobytes())
-    return found.hexdigest()[:12]
+        digest.update(np.ascontiguousarray(pairs[start : start + _SHARD]).tobytes())
+    return digest.hexdigest()[:12]

@@ -1,4 +1,4 @@
-"""Tracer and flow network learned together: the flow is computed inside the objective, so that tags teach it, too."""
+"""Tracer and flow network learned together: the flow is computed inside the objective, whose gradient reaches the network."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Flow(eqx.Module):
     forward_px: Float[Array, "time height width 2"]
     backward_px: Float[Array, "time height width 2"]
 
-    def given_to(self, frames: Frame) -> Frame:
+    def replace_in(self, frames: Frame) -> Frame:
         """The clip with this flow in place of its own."""
         return eqx.tree_at(lambda f: (f.forward_px, f.backward_px), frames, (self.forward_px, self.backward_px))
 
 
 class JointModel(eqx.Module):
-    """A tracer, the flow network that it sees with, and how much that network's own loss weighs beside the reads."""
+    """A tracer, the flow network that gives its flow, and the weight of the network's own loss beside the tracer's objective."""
 
     tracer: AbstractTracer
     network: AbstractFlowNetwork
@@ -43,7 +43,7 @@ class JointModel(eqx.Module):
 
 
 PAIRS_AT_ONCE = 4
-"""Pairs of pictures whose flow is computed together: the last group may be smaller, and is then compiled by itself."""
+"""Pairs of pictures whose flow is computed together; the last group may be smaller, and is then compiled separately."""
 
 
 def network_flow(
@@ -51,11 +51,11 @@ def network_flow(
 ) -> tuple[Flow, Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The flow of a clip's pictures at its working resolution, and the network's loss on them with its terms.
 
-    As in the cache, flow that explains no more than rest is zero (`is_moving`); the loss is of the flow before that, on
-    the whole pictures, which repeat their edges where the network asks for other sizes.
+    As in the cache, flow that explains the pictures no better than zero flow is set to zero (`is_moving`). The loss is
+    computed before that, on the whole pictures, padded by their edges to the sizes that the network needs.
     """
     if frames.colour is None:
-        raise ValueError("The clip holds no pictures; load it with colour=True to compute flow from them.")
+        raise ValueError("found a clip without pictures; load it with colour=True to compute flow from them.")
     stride = _stride(frames)
 
     def pair(network: AbstractFlowNetwork, one: UInt8[Array, "_ _ 3"], other: UInt8[Array, "_ _ 3"]):
@@ -76,12 +76,12 @@ def network_flow(
         ways = working(forward[-1], *pictures), working(backward[-1], *pictures[::-1])
         return ways, terms
 
-    # In turn, so that memory holds the activations of a few; but not by `lax.map`: in a loop XLA's CPU backend takes
+    # One group after the other, to bound the memory of activations; but not by `lax.map`: in a loop XLA's CPU backend takes
     # twelve times as long over convolutions.
     several = eqx.filter_checkpoint(eqx.filter_vmap(pair, in_axes=(None, 0, 0)))
     places = [slice(i, i + PAIRS_AT_ONCE) for i in range(0, len(frames.colour) - 1, PAIRS_AT_ONCE)]
-    done = [several(network, frames.colour[:-1][place], frames.colour[1:][place]) for place in places]
-    (forward, backward), terms = jax.tree.map(lambda *parts: jnp.concatenate(parts), *done)
+    groups = [several(network, frames.colour[:-1][place], frames.colour[1:][place]) for place in places]
+    (forward, backward), terms = jax.tree.map(lambda *parts: jnp.concatenate(parts), *groups)
     first = jnp.zeros_like(forward[:1])
     terms = jax.tree.map(jnp.mean, terms)
     flow = Flow(*(jnp.concatenate([first, way]) for way in (forward, backward)))
@@ -89,17 +89,19 @@ def network_flow(
 
 
 def _stride(frames: Frame) -> int:
-    """Every how many-th pixel of the pictures the working resolution keeps."""
+    """The stride in pixels from the pictures to the working resolution."""
     assert frames.colour is not None
     (height, width), (rows, columns) = frames.colour.shape[1:3], frames.depth_m.shape[1:3]
     stride = -(-height // rows)
     if (-(-height // stride), -(-width // stride)) != (rows, columns):
-        raise ValueError(f"Pictures of {height}x{width} pixels do not thin out to depth of {rows}x{columns}.")
+        raise ValueError(
+            f"found pictures of {height}x{width} pixels with depth of {rows}x{columns}; expected the pictures at every n-th pixel."
+        )
     return stride
 
 
 def save_network(path: Path, model: JointModel, settings: Mapping[str, Any]) -> None:
-    """Write the model's flow network, which `settings` build, as weights that flows are named by (`make_flow`)."""
+    """Write the weights of the model's flow network; `settings` are those that it was built from. `make_flow` reads the file."""
     save_weights(path, model.network, {"flow": dict(settings), "learned_with": type(model.tracer).__name__})
 
 
@@ -109,7 +111,7 @@ class JointSettings:
 
     flow: Mapping[str, Any]
     optimizer: Mapping[str, Any]
-    init: str | None = "default"  # weights to begin with: `default` or a file; random ones if None
+    init: str | None = "default"  # initial weights: `default` or a file; random if None
     clip_norm: float = 1.0
     weight: float = 1.0  # of the network's own loss beside the tracer's objective
     loss: FlowLossSettings = dataclasses.field(default_factory=lambda: FlowLossSettings(occlusion_after=0))

@@ -1,6 +1,6 @@
-"""Where numbers go while training: metrics.jsonl always, Weights & Biases if asked for.
+"""Logged metrics of a training run: metrics.jsonl always, Weights & Biases if enabled.
 
-A run is whole without Weights & Biases: none of its errors ends one.
+A run is complete without Weights & Biases, and none of its errors ends a run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..core.files import write_atomic
 from .processes import is_first
 
 _FINISH_S = 600.0
-"""At the end wandb may upload for so long; what is left lies in the run folder for `wandb sync`."""
+"""Time limit of wandb's upload at the end; what is not uploaded stays in the run folder for `wandb sync`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,26 +33,26 @@ class LoggerSettings:
 
 
 class MetricsFile:
-    """Appends one JSON object a line. Lines of steps that a resumed run does again are dropped first."""
+    """Appends one JSON object per line. Lines of steps that a resumed run repeats are dropped first."""
 
     def __init__(self, path: Path, *, resume_step: int = 0):
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists():
-            kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= resume_step]
+            kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _line_step(line) <= resume_step]
             write_atomic(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         with self.path.open("a", encoding="utf-8") as file:
-            # NaN is no JSON; null is.
+            # JSON has no NaN; null stands for it.
             finite = {
                 name: value if value == value and abs(value) != float("inf") else None for name, value in values.items()
             }
             file.write(json.dumps({"step": step, **finite}) + "\n")
 
 
-def _step_of(line: str) -> float:
-    """Step of a line; infinite for one cut short by a kill, so that it is dropped."""
+def _line_step(line: str) -> float:
+    """The step of a line; infinite for an incomplete line, so that it is dropped."""
     try:
         return float(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):
@@ -68,32 +68,32 @@ class Logger:
         self._file, self._run = None, None
         if is_first():
             self._file = MetricsFile(folder / "metrics.jsonl", resume_step=resume_step)
-            self._run = _open_wandb(folder, settings, config or {}, going_on=resume_step > 0)
+            self._run = _open_wandb(folder, settings, config or {}, resumed=resume_step > 0)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         if self._file is not None:
             self._file.write(step, values)
         if self._run is not None:
-            with self._unharmed("a step's numbers"):
+            with self._errors_as_warnings("a step's numbers"):
                 self._run.log(dict(values), step=step)
 
     def report(self, folder: Path, scores: Mapping[str, float], *, tracer: str) -> None:
-        """Final scores, the report's curves, and overlay pictures of one tracer; they lie in `folder` in any case."""
+        """Final scores, the report's curves, and overlay pictures of one tracer, which `folder` holds."""
         if self._run is not None:
-            with self._unharmed("the report"):
+            with self._errors_as_warnings("the report"):
                 _report(self._run, folder, scores, tracer)
 
     def close(self) -> None:
         if self._run is not None:
-            with self._unharmed("the end of the run"):
+            with self._errors_as_warnings("the end of the run"):
                 self._run.finish()
 
     @contextmanager
-    def _unharmed(self, what: str) -> Iterator[None]:
+    def _errors_as_warnings(self, what: str) -> Iterator[None]:
         try:
             yield
-        except Exception as error:  # wandb's own, and those of the process that it talks to, are of many kinds
-            warnings.warn(f"Weights & Biases did not take {what}: {_said(error)} The run goes on.", stacklevel=4)
+        except Exception as error:  # of many types: wandb's own, and those of its service process
+            warnings.warn(f"Weights & Biases could not log {what}: {_one_line(error)} The run continues.", stacklevel=4)
 
 
 def _report(run: Any, folder: Path, scores: Mapping[str, float], tracer: str) -> None:
@@ -115,24 +115,24 @@ def _report(run: Any, folder: Path, scores: Mapping[str, float], tracer: str) ->
         run.log(pictures)
 
 
-def _said(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     """An error in one line that ends in a full stop."""
     lines = f"{type(error).__name__}: {error}".strip().splitlines()
     return lines[0].rstrip(":. ") + "."
 
 
-def _run_id(folder: Path, going_on: bool) -> str:
-    """What wandb knows the run by, kept in its folder: a run that is gone on with stays one run, also when uploaded later."""
+def _run_id(folder: Path, resumed: bool) -> str:
+    """The run's id in wandb, kept in its folder, so that a resumed run stays one run, also when uploaded later."""
     path = folder / "wandb_id"
-    if not (going_on and path.exists()):
-        path.write_text(secrets.token_hex(4) + "\n", encoding="utf-8")
+    if not (resumed and path.exists()):
+        write_atomic(path, secrets.token_hex(4) + "\n")
     return path.read_text(encoding="utf-8").strip()
 
 
-def _open_wandb(folder: Path, settings: LoggerSettings, config: Mapping[str, Any], *, going_on: bool) -> Any:
+def _open_wandb(folder: Path, settings: LoggerSettings, config: Mapping[str, Any], *, resumed: bool) -> Any:
     mode = os.environ.get("WANDB_MODE", settings.mode)
     if mode not in ("disabled", "offline", "online"):
-        raise ValueError(f"Weights & Biases mode {mode!r}; expected disabled, offline or online.")
+        raise ValueError(f"Weights & Biases: found mode {mode!r}; expected disabled, offline or online.")
     if mode == "disabled":
         return None
     try:
@@ -140,18 +140,18 @@ def _open_wandb(folder: Path, settings: LoggerSettings, config: Mapping[str, Any
     except ImportError:
         warnings.warn("wandb is not installed: only metrics.jsonl is written.", stacklevel=3)
         return None
-    named = _run_id(folder, going_on)
+    run_id = _run_id(folder, resumed)
     quiet: dict[str, Any] = {"silent": True, "console": "off", "x_disable_stats": True}
     quiet |= {"disable_git": True, "disable_code": True}
-    if "finish_timeout" in wandb.Settings.model_fields:  # of newer releases
+    if "finish_timeout" in wandb.Settings.model_fields:  # in newer releases only
         quiet["finish_timeout"] = _FINISH_S
 
-    def begin(mode: Literal["offline", "online"]) -> Any:
+    def start(mode: Literal["offline", "online"]) -> Any:
         return wandb.init(
             project=settings.project,
             name=settings.name or folder.name,
-            id=named,
-            resume="allow" if mode == "online" else None,  # offline there is nothing to ask
+            id=run_id,
+            resume="allow" if mode == "online" else None,  # offline mode cannot look the run up
             dir=str(folder),
             mode=mode,
             config=dict(config),
@@ -162,17 +162,17 @@ def _open_wandb(folder: Path, settings: LoggerSettings, config: Mapping[str, Any
         if mode == "online":
             # Without a key the online mode would stop and ask for one.
             if wandb.api.api_key:
-                return begin("online")
+                return start("online")
             warnings.warn("No Weights & Biases key: logging offline. Upload later with `wandb sync`.", stacklevel=3)
-    except Exception as error:  # wandb's own are of many kinds
+    except Exception as error:  # wandb's errors are of many types
         warnings.warn(
-            f"Weights & Biases cannot be reached: {_said(error)} Logging offline; upload later with `wandb sync`.",
+            f"Weights & Biases cannot be reached: {_one_line(error)} Logging offline; upload later with `wandb sync`.",
             stacklevel=3,
         )
         with suppress(Exception):
-            wandb.teardown()  # its process holds the id as one in use
+            wandb.teardown()  # its service process still holds the id as in use
     try:
-        return begin("offline")
+        return start("offline")
     except Exception as error:
-        warnings.warn(f"Weights & Biases does not begin: {_said(error)} Only metrics.jsonl is written.", stacklevel=3)
+        warnings.warn(f"Weights & Biases cannot start: {_one_line(error)} Only metrics.jsonl is written.", stacklevel=3)
         return None

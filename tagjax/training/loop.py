@@ -1,4 +1,4 @@
-"""The training loop: plain Python around one update, with progress, logs, checkpoints and a clean way out."""
+"""The training loop: plain Python around one update, with progress, logs, checkpoints and a clean stop."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .checkpoint import CheckpointError, Checkpoints
 from .logging import Logger
-from .processes import any_process, is_first, share_of
-from .state import Stepped
+from .processes import any_process, is_first, local_batch_size
+from .state import HasStep
 
-StateT = TypeVar("StateT", bound=Stepped)
+StateT = TypeVar("StateT", bound=HasStep)
 
 
 @runtime_checkable
 class DataIterator(Protocol):
-    """An endless source of samples whose place can be kept: what Grain's iterators are."""
+    """An endless iterator over samples whose position can be saved and restored, as Grain's iterators have it."""
 
     def __next__(self) -> Any: ...
 
@@ -33,14 +33,14 @@ class DataIterator(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class LoopSettings:
-    """How long, and how often what is written."""
+    """The number of steps, and how often logs, checkpoints and validation are written."""
 
     num_steps: int = 14
     batch_size: int = 1  # samples whose gradients are averaged in a step, over all devices and processes
     checkpoint_every: int = 7
     validate_every: int = 7
     log_every: int = 1
-    stop_after_skipped: int = 5  # steps without a finite gradient, one after the other
+    stop_after_skipped: int = 5  # steps in a row without a finite gradient
     progress: bool = True
 
     def __post_init__(self) -> None:
@@ -61,8 +61,8 @@ class DivergedError(RuntimeError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Trained(Generic[StateT]):
-    """How a call of `train` ended."""
+class TrainingResult(Generic[StateT]):
+    """The last state of a call of `train`, and whether it was interrupted."""
 
     state: StateT
     interrupted: bool
@@ -70,39 +70,39 @@ class Trained(Generic[StateT]):
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C and SIGTERM into a flag, so that the step in progress ends; a second Ctrl-C stops at once.
+    """Turns Ctrl-C and SIGTERM into a flag, so that the step in progress is finished; a second Ctrl-C stops at once.
 
-    SIGTERM is what a scheduler sends before it kills, maybe more than once: it never stops at once.
+    Schedulers send SIGTERM before they kill a job, sometimes repeatedly; it never stops at once.
     """
-    asked = threading.Event()
+    stop_requested = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
+        yield stop_requested.is_set
         return
 
     def handler(number: int, frame: Any) -> None:
-        if asked.is_set() and number == signal.SIGINT:
+        if stop_requested.is_set() and number == signal.SIGINT:
             raise KeyboardInterrupt
-        asked.set()
+        stop_requested.set()
 
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield asked.is_set
+        yield stop_requested.is_set
     finally:
         for number, earlier in before.items():
-            # None is one that Python did not set (JAX's runtime of several processes): it cannot be put back.
+            # None: the handler was not set by Python (but by JAX's distributed runtime) and cannot be restored.
             signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
 
 
-def resumed(state: StateT, samples: DataIterator, checkpoints: Checkpoints, *, allowed: bool) -> StateT:
-    """The newest checkpoint's state, with the samples at its place; the given state where there is no checkpoint.
+def resume_state(state: StateT, samples: DataIterator, checkpoints: Checkpoints, *, allowed: bool) -> StateT:
+    """The newest checkpoint's state, with `samples` moved to its position; `state` itself where there is no checkpoint.
 
-    Raises `CheckpointError` if there is one and going on is not `allowed`.
+    Raises `CheckpointError` if there is one and resuming is not `allowed`.
     """
     if not checkpoints.steps():
         return state
     if not allowed:
         raise CheckpointError(
-            f"{checkpoints.folder.parent} holds a run already; set resume=true or choose another folder."
+            f"{checkpoints.folder.parent} already holds a run; set resume=true or choose another folder."
         )
     state, data_state = checkpoints.restore(state)
     samples.set_state(data_state)
@@ -119,16 +119,16 @@ def train(
     checkpoints: Checkpoints,
     validate: Callable[[StateT], Mapping[str, float]] | None = None,
     after_step: Callable[[StateT], None] | None = None,
-    shown: Sequence[str] = ("loss", "own_coherence"),
-) -> Trained[StateT]:
-    """Train from `state.step` to `num_steps`; a checkpoint is written at the end, or when Ctrl-C, SIGTERM or the samples end it.
+    displayed: Sequence[str] = ("loss", "own_coherence"),
+) -> TrainingResult[StateT]:
+    """Train from `state.step` to `num_steps`; a checkpoint is written at the end, and on Ctrl-C, SIGTERM or an error of `samples`.
 
-    `update` does one step on this process's share of `batch_size` samples and gives numbers to log, which are the same
-    in all processes; `shown` names those beside the progress bar. `validate` gives numbers that are logged under
+    `update` does one step on this process's part of `batch_size` samples and returns metrics to log, which are the same
+    in all processes; `displayed` lists those beside the progress bar. `validate` returns metrics that are logged under
     `validation/`; `after_step` is called after every step.
 
-    A step whose `skipped` is 1 changed nothing, and no checkpoint is due after it. Raises `DivergedError` after
-    `stop_after_skipped` of them in a row; it names the last checkpoint written before the first of them.
+    A step with `skipped` = 1 leaves the parameters unchanged, and no checkpoint is written after it. Raises
+    `DivergedError` after `stop_after_skipped` of them in a row; its message gives the last checkpoint before them.
     """
     columns = (
         TextColumn("[bold]train"),
@@ -139,21 +139,23 @@ def train(
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    begun, skipped, share = int(state.step), 0, share_of(settings.batch_size)
-    done = begun
+    first_step, skipped, batch_size = int(state.step), 0, local_batch_size(settings.batch_size)
+    done = first_step
     quiet = not settings.progress or not is_first()
-    with _stop_on_interrupt() as stop_asked, Progress(*columns, disable=quiet) as progress:
+    with _stop_on_interrupt() as stop_requested, Progress(*columns, disable=quiet) as progress:
         task = progress.add_task("train", total=settings.num_steps, completed=done, numbers="compiling")
-        stopping = any_process(stop_asked())
+        stopping = any_process(stop_requested())
         while done < settings.num_steps and not stopping:
             place = samples.get_state()
             try:
-                batch = [next(samples) for _ in range(share)]
+                batch = [next(samples) for _ in range(batch_size)]
             except Exception as error:
-                # Whatever a source raises, the steps done so far are sound; the batch is drawn again when the run goes on.
-                if done > begun:
+                # Whatever the source raises, the steps done so far are valid; the batch is drawn again on resuming.
+                if done > first_step:
                     checkpoints.save(state, place)
-                    error.add_note(f"The run is saved at step {done} in {checkpoints.folder}; it can go on from there.")
+                    error.add_note(
+                        f"The run is saved at step {done} in {checkpoints.folder}; it can be resumed from there."
+                    )
                 raise
             state, numbers = update(state, batch)
             done += 1
@@ -164,30 +166,29 @@ def train(
             if done % settings.log_every == 0 or done == settings.num_steps:
                 logger.write(done, numbers)
             if validate is not None and (done % settings.validate_every == 0 or done == settings.num_steps):
-                found = {f"validation/{name}": value for name, value in validate(state).items()}
-                logger.write(done, found)
-            # While steps are skipped none is written: those kept would push the last good one out.
+                logger.write(done, {f"validation/{name}": value for name, value in validate(state).items()})
+            # No checkpoint is written while steps are skipped: it would displace the last good one.
             if (done % settings.checkpoint_every == 0 and not skipped) or done == settings.num_steps:
                 checkpoints.save(state, samples.get_state())
             if after_step is not None:
                 after_step(state)
-            told = "  ".join(f"{name} {numbers[name]:.3f}" for name in shown if name in numbers)
-            progress.update(task, completed=done, numbers=told)
-            stopping = any_process(stop_asked())
+            text = "  ".join(f"{name} {numbers[name]:.3f}" for name in displayed if name in numbers)
+            progress.update(task, completed=done, numbers=text)
+            stopping = any_process(stop_requested())
         if stopping:
             jax.block_until_ready(state.step)
             checkpoints.save(state, samples.get_state())
-    return Trained(state, done < settings.num_steps)
+    return TrainingResult(state, done < settings.num_steps)
 
 
 def _diverged(checkpoints: Checkpoints, done: int, skipped: int) -> str:
-    good = [step for step in checkpoints.steps() if step <= done - skipped]
-    there = (
-        f"the last good checkpoint is step {good[-1]} in {checkpoints.folder}. Go on from there by retune=true"
-        if good
+    before = [step for step in checkpoints.steps() if step <= done - skipped]
+    advice = (
+        f"the last good checkpoint is step {before[-1]} in {checkpoints.folder}. Resume from it by retune=true"
+        if before
         else f"no checkpoint was written before them in {checkpoints.folder}. Start again"
     )
     return (
-        f"The loss or its gradient was not finite in {skipped} steps in a row, up to step {done}; {there} "
+        f"The loss or its gradient was not finite in {skipped} steps in a row, up to step {done}; {advice} "
         "with a smaller learning rate or clip_norm, and look at the data of these steps."
     )

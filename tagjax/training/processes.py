@@ -1,7 +1,7 @@
 """Processes that train one model together, on one machine or on many, by JAX's own runtime.
 
-Every process runs the same program on its share of each batch; they meet in collectives, so what one of them calls all
-have to call. Process 0 is the one that writes.
+Every process runs the same program on its part of each batch. Collective functions must be called by all processes.
+Only process 0 writes files.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ T = TypeVar("T", bound=PyTree)
 
 @dataclasses.dataclass(frozen=True)
 class DistributedSettings:
-    """How the processes find each other. By default there is one."""
+    """How the processes find each other. By default there is one process."""
 
     automatic: bool = False  # ask the scheduler, as JAX does: Slurm, Open MPI, Kubernetes
     coordinator: str | None = None  # host:port at which process 0 listens
@@ -34,7 +34,7 @@ class DistributedSettings:
     def __post_init__(self) -> None:
         if self.timeout_s < 1 or self.num_processes < 1:
             raise ValueError(
-                f"distributed: timeout_s is {self.timeout_s}, num_processes {self.num_processes}; at least 1 is needed."
+                f"distributed: timeout_s is {self.timeout_s}, num_processes {self.num_processes}; expected at least 1."
             )
         if not 0 <= self.process_id < self.num_processes:
             raise ValueError(
@@ -49,12 +49,12 @@ class DistributedSettings:
 
 
 @contextmanager
-def joined(settings: DistributedSettings) -> Iterator[None]:
-    """Within it all processes are one machine of many devices. To be entered before anything is computed.
+def distributed_runtime(settings: DistributedSettings) -> Iterator[None]:
+    """JAX's distributed runtime, in which all processes act as one machine with many devices.
 
-    They part when all have come to the end. An error in one leaves the others without a partner: JAX's runtime ends
-    them, and the run goes on from its newest checkpoint when all are started again. Raises `ValueError` where the
-    scheduler was to be asked and there is none.
+    To be entered before anything is computed. The runtime is shut down when all processes have left the context. After
+    an error in one process JAX's runtime ends the others; the run resumes from its newest checkpoint when all are
+    started again. Raises `ValueError` where `automatic` is set and there is no scheduler.
     """
     if not settings.automatic and settings.num_processes == 1:
         yield
@@ -80,12 +80,12 @@ def joined(settings: DistributedSettings) -> Iterator[None]:
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes."""
+    """Whether this is process 0, which writes files."""
     return jax.process_index() == 0
 
 
-def share_of(batch_size: int) -> int:
-    """How many of a batch's samples each process takes. Raises `ValueError` unless all can take as many."""
+def local_batch_size(batch_size: int) -> int:
+    """The number of a batch's samples for each process. Raises `ValueError` unless the batch divides evenly."""
     count = jax.process_count()
     if batch_size % count:
         raise ValueError(f"loop.batch_size is {batch_size}; over {count} processes it must be a multiple of {count}.")
@@ -93,34 +93,34 @@ def share_of(batch_size: int) -> int:
 
 
 def mean_over_processes(tree: T) -> T:
-    """The mean of arrays that every process has its own values of; the same bits everywhere."""
+    """The mean over processes of arrays with different values in each; bit-identical in all processes."""
     if jax.process_count() == 1:
         return tree
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    # Gathered and added up in the same order by all: they must not drift apart.
+    arrays, static = eqx.partition(tree, eqx.is_array)
+    # Gathered and summed in the same order by all, so that the processes cannot diverge.
     gathered = multihost_utils.process_allgather(jax.tree.map(np.asarray, arrays))
     mean = jax.tree.map(lambda leaf: jax.numpy.asarray(np.mean(leaf, axis=0, dtype=leaf.dtype)), gathered)
-    return eqx.combine(mean, rest)
+    return eqx.combine(mean, static)
 
 
 def any_process(flag: bool) -> bool:
-    """Whether any process says so."""
+    """Whether the flag is set in any process."""
     if jax.process_count() == 1:
         return flag
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 
-def arrays_of_first(tree: T) -> T:
-    """The arrays as process 0 has them; shapes and dtypes must be the same everywhere."""
+def broadcast_arrays(tree: T) -> T:
+    """The arrays of process 0; shapes and dtypes must be the same in all processes."""
     if jax.process_count() == 1:
         return tree
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    sent = multihost_utils.broadcast_one_to_all(jax.tree.map(np.asarray, arrays))
-    return eqx.combine(jax.tree.map(jax.numpy.asarray, sent), rest)
+    arrays, static = eqx.partition(tree, eqx.is_array)
+    received = multihost_utils.broadcast_one_to_all(jax.tree.map(np.asarray, arrays))
+    return eqx.combine(jax.tree.map(jax.numpy.asarray, received), static)
 
 
-def plain_of_first(content: Any) -> Any:
-    """What process 0 has, of plain JSON."""
+def broadcast_json(content: Any) -> Any:
+    """The plain JSON content of process 0."""
     if jax.process_count() == 1:
         return content
     text = np.frombuffer(json.dumps(content).encode(), np.uint8)

@@ -1,4 +1,4 @@
-"""A whole training run in a folder: recordings in, checkpoints, logs, and a report on the held-out recordings out."""
+"""A whole training run in a folder: its inputs are recordings, its outputs checkpoints, logs, and a report on validation."""
 
 from __future__ import annotations
 
@@ -11,27 +11,25 @@ import jax
 import numpy as np
 import optax
 from rich.console import Console
-from rich.progress import track
 
 from ..core.build import build
 from ..core.results import to_json_values, write_json
-from ..core.settings import ConfigError
-from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
-from ..report.report import score_table, write_report
+from ..report.report import score_table
 from ..tagattention import TagAttention
 from ..tagattention.learned import save_parameters
 from ..tagattention.tracer_settings import make_tracer
-from ..tracing.clips import Antennas, Clip, ClipSettings, clip_loader
+from ..tracing.clips import Clip, clip_loader
 from ..tracing.tracer import AbstractTracer
 from .checkpoint import Checkpoints
 from .clip_dataset import clip_dataset
 from .config import TrainConfig
+from .evaluate import evaluate_tracers, parameters, smoothing_tracers
 from .flow_run import initial_network
 from .joint import JointModel, save_network
 from .logging import Logger
-from .loop import Trained, resumed, train
-from .processes import is_first, joined, share_of
+from .loop import TrainingResult, resume_state, train
+from .processes import distributed_runtime, is_first, local_batch_size
 from .sources import training_recordings
 from .state import TrainState
 from .step import clip_loss, make_joint_optimizer, make_optimizer, train_step
@@ -40,7 +38,7 @@ VALIDATION_CLIPS = 2
 
 
 def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
-    """What a run trains, before its first step: the tracer, with a flow network if `config.joint` asks for one."""
+    """The untrained model of a run: the tracer, with a flow network if `config.joint` is set."""
     tracer = make_tracer(config.tracer, config.weights)
     if config.joint is None:
         return tracer
@@ -52,13 +50,15 @@ def initial_state(config: TrainConfig) -> tuple[TrainState, optax.GradientTransf
     """The state before the first step, and the optimiser."""
     optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
     if config.joint is not None:
-        of_network = make_optimizer(build(config.joint.optimizer, where="joint.optimizer"), config.joint.clip_norm)
-        optimizer = make_joint_optimizer(optimizer, of_network)
+        network_optimizer = make_optimizer(
+            build(config.joint.optimizer, where="joint.optimizer"), config.joint.clip_norm
+        )
+        optimizer = make_joint_optimizer(optimizer, network_optimizer)
     return TrainState.create(make_model(config), optimizer, seed=config.seed), optimizer
 
 
-def own_flow(model: AbstractTracer | JointModel, config: TrainConfig, path: Path) -> str:
-    """The name of the flow that a run's model is evaluated with; a network's weights are written to `path` for it."""
+def evaluation_flow(model: AbstractTracer | JointModel, config: TrainConfig, path: Path) -> str:
+    """The name of the flow that a run's model is evaluated with: of a joint model its own network, written to `path`."""
     if isinstance(model, JointModel) and config.joint is not None:
         save_network(path, model, config.joint.flow)
         return str(path)
@@ -66,17 +66,17 @@ def own_flow(model: AbstractTracer | JointModel, config: TrainConfig, path: Path
 
 
 def run_training(config: TrainConfig, folder: Path, *, console: Console | None = None) -> float:
-    """Train as configured, evaluate on the held-out recordings, and return the number a sweep should maximise.
+    """Train as configured, evaluate on the validation recordings, and return the objective of a sweep, to be maximised.
 
-    That number is the mean box IoU on the held-out recordings if they are labelled, else the coherence of the held-out
-    tags' reads with their masks' motion; NaN without any. `folder` then holds checkpoints, metrics.jsonl, what was
-    learned (weights.json, parameters.json, flow.safetensors), and where anything was held out metrics.json and report/. An
-    interrupted run leaves a checkpoint, goes on from it when started again in the same folder, and returns NaN. Of
-    several processes (`config.distributed`) the first writes and evaluates; the others return NaN.
+    The objective is the mean box IoU on the validation recordings if they are labelled, else the coherence of their reads
+    with the masks' motion; NaN without validation recordings. `folder` then holds checkpoints, metrics.jsonl, the learned
+    parameters (weights.json, parameters.json, flow.safetensors), and with validation recordings metrics.json and report/.
+    An interrupted run writes a checkpoint, returns NaN, and resumes when started again in the same folder. With several
+    processes (`config.distributed`) process 0 writes and evaluates; the others return NaN.
     """
     console = console or Console()
-    with joined(config.distributed):  # before anything asks JAX for its devices
-        smoothed({"learned": make_tracer(config.tracer)}, config.scores)
+    with distributed_runtime(config.distributed):  # before JAX's devices are used for the first time
+        smoothing_tracers({"learned": make_tracer(config.tracer)}, config.scores)
         console.quiet = console.quiet or not is_first()
         training, validation = training_recordings(config.data)
         _describe(console, training, validation)
@@ -87,23 +87,23 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
             return float("nan")
         if trained.interrupted:
             console.print(
-                f"Stopped at step {int(trained.state.step)}; go on with the same command and hydra.run.dir={folder}"
+                f"Stopped at step {int(trained.state.step)}; resume with the same command and hydra.run.dir={folder}"
             )
             return float("nan")
-        tracers, flows = _keep_learned(config, folder, trained.state)
+        tracers, flows = _save_learned(config, folder, trained.state)
         if not validation:
-            console.print("No held-out recording: nothing to evaluate (data.validation is empty).")
+            console.print("No validation recordings (data.validation is empty): no evaluation.")
             return float("nan")
         summary = _report(config, folder, tracers, flows, validation)
-        first_name, found = next(iter(summary.items()))  # the learned tracer's, smoothed or not
-        logger.report(folder / "report", found["all"], tracer=first_name)
+        name, learned = next(iter(summary.items()))  # the learned tracer comes first
+        logger.report(folder / "report", learned["all"], tracer=name)
     finally:
         logger.close()
-    console.print(score_table(summary, title="held-out recordings"))
-    iou = found["all"].get("iou")
+    console.print(score_table(summary, title="validation recordings"))
+    iou = learned["all"].get("iou")
     if iou is not None:
         return float(iou)
-    return held_out_numbers(trained.state, held_out_clips(config, validation), config).get(
+    return validation_metrics(trained.state, validation_clips(config, validation), config).get(
         "own_coherence", float("nan")
     )
 
@@ -114,8 +114,8 @@ def _train(
     training: Sequence[Recording],
     validation: Sequence[Recording],
     console: Console,
-) -> tuple[Trained[TrainState], Logger]:
-    """The trained state, and the logger, which is left open for the report."""
+) -> tuple[TrainingResult[TrainState], Logger]:
+    """The trained state, and the logger, which stays open for the report."""
     clips, batch_size = config.data.clips, config.loop.batch_size
     state, optimizer = initial_state(config)
     source = iter(
@@ -127,26 +127,24 @@ def _train(
             min_motion=clips.min_motion,
             max_tags=clips.max_tags,
             workers=clips.workers,
-            share=(jax.process_index(), jax.process_count()),
+            shard=(jax.process_index(), jax.process_count()),
             colour=config.joint is not None,
             **clips.arguments(),
         )
     )
-    idle = jax.local_device_count() - share_of(batch_size)
+    idle = jax.local_device_count() - local_batch_size(batch_size)
     if idle > 0:
-        console.print(
-            f"loop.batch_size={batch_size} leaves {idle} of {jax.local_device_count()} devices without a clip."
-        )
-    # Every process looks at all of them: none has to wait for another that does.
-    held_out = held_out_clips(config, validation)
+        console.print(f"loop.batch_size={batch_size} leaves {idle} of {jax.local_device_count()} devices idle.")
+    # Every process evaluates all of them, so that none waits for another.
+    clips_held_out = validation_clips(config, validation)
     with Checkpoints(folder / "checkpoints") as checkpoints:
-        state = resumed(state, source, checkpoints, allowed=config.resume)
+        state = resume_state(state, source, checkpoints, allowed=config.resume)
         if int(state.step):
             console.print(f"Resumed at step {int(state.step)} of {config.loop.num_steps}.")
         logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=int(state.step))
 
         def validate(state: TrainState) -> dict[str, float]:
-            return held_out_numbers(state, held_out, config)
+            return validation_metrics(state, clips_held_out, config)
 
         try:
             trained = train(
@@ -156,7 +154,7 @@ def _train(
                 settings=config.loop,
                 logger=logger,
                 checkpoints=checkpoints,
-                validate=validate if held_out else None,
+                validate=validate if clips_held_out else None,
             )
         except BaseException:
             logger.close()
@@ -166,19 +164,19 @@ def _train(
     return trained, logger
 
 
-def _keep_learned(
+def _save_learned(
     config: TrainConfig, folder: Path, state: TrainState
 ) -> tuple[dict[str, AbstractTracer], dict[str, str]]:
-    """Write what was learned; the learned tracer, that before the first step and the baselines; flows of their own.
+    """Write the learned parameters. Returns the tracers (learned, before training, baselines) and the flow of the first two.
 
-    Where a flow network was learned with it, each of the two sees with its own, kept as flow.safetensors and
-    flow_untrained.safetensors (flow_initial.safetensors, where it began from learned parameters).
-    The learned parameters are kept as weights.json, and all tracers' as parameters.json.
+    The learned parameters are written to weights.json, those of all tracers to parameters.json. Where a flow network was
+    trained jointly, the learned and the untrained tracer each use their own, written to flow.safetensors and
+    flow_untrained.safetensors (flow_initial.safetensors, where training started from learned parameters).
     """
     before = "untrained" if config.weights is None else "initial"
     models = {"learned": state.model, before: make_model(config)}
     files = {"learned": folder / "flow.safetensors", before: folder / f"flow_{before}.safetensors"}
-    flows = {name: own_flow(model, config, files[name]) for name, model in models.items()}
+    flows = {name: evaluation_flow(model, config, files[name]) for name, model in models.items()}
     tracers = {name: model.tracer if isinstance(model, JointModel) else model for name, model in models.items()}
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
     if isinstance(tracers["learned"], TagAttention):
@@ -197,7 +195,7 @@ def _report(
     flows: Mapping[str, str],
     validation: Sequence[Recording],
 ) -> dict[str, Any]:
-    """Evaluate the tracers on what was held out; the report's summary."""
+    """Evaluate the tracers on the validation recordings; the report's summary."""
     summary = evaluate_tracers(
         tracers,
         validation,
@@ -213,23 +211,15 @@ def _report(
     return summary
 
 
-def parameters(tracer: AbstractTracer) -> dict[str, float]:
-    """The tracer's scalar parameters by name, in physical units where it can tell them (`physical`)."""
-    physical = getattr(tracer, "physical", None)
-    if physical is not None:
-        return dict(physical())
-    return {name: float(leaf) for name, leaf in vars(tracer).items() if isinstance(leaf, jax.Array) and leaf.ndim == 0}
-
-
-def held_out_numbers(state: TrainState, clips: Sequence[Clip], config: TrainConfig) -> dict[str, float]:
-    """Mean of every term and diagnostic over held-out clips, always with the same random shifts."""
+def validation_metrics(state: TrainState, clips: Sequence[Clip], config: TrainConfig) -> dict[str, float]:
+    """Mean of every term and diagnostic over validation clips, always with the same random shifts."""
     key = jax.random.PRNGKey(config.seed)
-    ones = [clip_loss(state.model, clip.camera, clip.frames, key, config.objective) for clip in clips]
-    return {name: float(np.mean([float(one[name]) for one in ones])) for name in ones[0]}
+    values = [clip_loss(state.model, clip.camera, clip.frames, key, config.objective) for clip in clips]
+    return {name: float(np.mean([float(clip[name]) for clip in values])) for name in values[0]}
 
 
-def held_out_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list[Clip]:
-    """A few clips spread over each recording, of the training clips' length (or shorter, if the recording is)."""
+def validation_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list[Clip]:
+    """`VALIDATION_CLIPS` evenly spaced clips of each recording, of the training clips' length (or shorter, if the recording is)."""
     settings = config.data.clips
     load = clip_loader(settings, colour=config.joint is not None)
     clips = []
@@ -240,74 +230,8 @@ def held_out_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list
     return clips
 
 
-def smoothed(tracers: Mapping[str, AbstractTracer], settings: ScoreSettings) -> set[str]:
-    """Names of the tracers that go backwards first: with `settings.smooth` all that can. Raises `ConfigError` if none can."""
-    names = {name for name, tracer in tracers.items() if settings.supported_by(tracer).smooth}
-    if settings.smooth and not names:
-        kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
-        raise ConfigError(f"scores.smooth: {kinds} goes forwards only; expected TagAttention. Set scores.smooth=false.")
-    return names
-
-
-def antennas_for(tracer: AbstractTracer, antennas: Antennas) -> Antennas:
-    """The antennas that a tracer is given: the busiest one (None) where it knows one only and several are asked for."""
-    several = antennas == "all" or (antennas is not None and len(antennas) > 1)
-    return None if tracer.one_antenna and several else antennas
-
-
-def evaluate_tracers(
-    tracers: Mapping[str, AbstractTracer],
-    recordings: Sequence[Recording],
-    folder: Path,
-    *,
-    clips: ClipSettings,
-    estimators: Mapping[str, str] | None = None,
-    flows: Mapping[str, str] | None = None,
-    settings: ScoreSettings,
-    epcs: Sequence[str] | None = None,
-    frames: tuple[int, int] | None = None,
-    progress: bool = True,
-) -> dict[str, Any]:
-    """Run each tracer over each recording, write the report into `folder` and return its summary.
-
-    `estimators` and `flows` name the radio estimator and the flow of tracers that do not take the clips' own; a tracer that
-    knows one antenna gets the busiest one where the clips take several. With
-    `settings.smooth` those that can smooth do, which their names tell; the others go forwards only. Raises `ConfigError`
-    where none can.
-    """
-    estimators, flows = estimators or {}, flows or {}
-    loaders = {
-        name: clip_loader(
-            dataclasses.replace(
-                clips,
-                estimator=estimators.get(name, clips.estimator),
-                flow=flows.get(name, clips.flow),
-                antennas=antennas_for(tracer, clips.antennas),
-            )
-        )
-        for name, tracer in tracers.items()
-    }
-    smooth = smoothed(tracers, settings)
-    shown = {name: f"{name}_smoothed" if name in smooth else name for name in tracers}
-    work = [(name, number) for name in tracers for number in range(len(recordings))]
-    results: dict[str, list[RecordingResult]] = {shown[name]: [] for name in tracers}
-    for name, number in track(work, description="evaluate", disable=not progress):
-        results[shown[name]].append(
-            evaluate_recording(
-                tracers[name],
-                recordings[number],
-                loaders[name],
-                stride=clips.stride,
-                epcs=epcs,
-                settings=settings.supported_by(tracers[name]),
-                frames=frames,
-            )
-        )
-    return write_report(folder, results)
-
-
 def _describe(console: Console, training: Sequence[Recording], validation: Sequence[Recording]) -> None:
-    for kind, recordings in (("train", training), ("held out", validation)):
+    for kind, recordings in (("train", training), ("validation", validation)):
         for recording in recordings:
             tags = len(recording.reads.epcs)
             console.print(

@@ -1,4 +1,4 @@
-"""Where training and validation recordings come from: stores with optional virtual tags, or a simulated suite."""
+"""Training and validation recordings, with optional virtual tags."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..tracing.clips import ClipSettings
 
 @dataclasses.dataclass(frozen=True)
 class DataSettings:
-    """Recordings for training, held-out ones, and how they become clips."""
+    """Recordings for training and validation, and the settings of their clips."""
 
     recordings: tuple[str, ...] = ()
     validation: tuple[str, ...] = ()
@@ -22,14 +22,14 @@ class DataSettings:
 
 
 def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recording]]:
-    """Training and held-out recordings by their paths, with virtual tags where tracks are given.
+    """Training and validation recordings, with virtual tags where tracks are given.
 
-    Raises `RecordingError` for recordings that cannot be used, or that are in both, and `ConfigError` without any.
+    Raises `RecordingError` for recordings that cannot be used or are in both lists, and `ConfigError` if there is none.
     """
     if not data.recordings:
         if data.validation:
             raise ConfigError(
-                f"data.validation names {', '.join(data.validation)}, but data.recordings is empty; expected both, or "
+                f"data.validation is {', '.join(data.validation)}, but data.recordings is empty; expected both, or "
                 "neither and suite=<name>."
             )
         if data.virtual_tag != VirtualTagSettings():
@@ -39,13 +39,15 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
         raise ConfigError(
             "data.recordings is empty; expected recordings: data.recordings=[a.zarr,...] or suite=<name>."
         )
-    held_out = {_place(path) for path in data.validation}
-    twice = [path for path in data.recordings if _place(path) in held_out]
+    validation = {_resolved(path) for path in data.validation}
+    twice = [path for path in data.recordings if _resolved(path) in validation]
     if twice:
-        raise RecordingError(f"{', '.join(sorted(twice))}: named both for training and for validation; hold it out.")
+        raise RecordingError(
+            f"{', '.join(sorted(twice))}: found in both data.recordings and data.validation; expected it in one of them."
+        )
     return open_recordings(data.recordings, data.virtual_tag), open_recordings(data.validation, data.virtual_tag)
 
 
-def _place(path: str) -> str:
-    """One name for a folder, however its path is written; addresses as they are."""
+def _resolved(path: str) -> str:
+    """The absolute path of a folder; URLs are left as they are."""
     return path if "://" in path else str(Path(path).resolve())

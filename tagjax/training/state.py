@@ -1,4 +1,4 @@
-"""What training carries from step to step."""
+"""The training state."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from .joint import JointModel
 
 
 @runtime_checkable
-class Stepped(Protocol):
-    """Any training state: it knows how many steps were done."""
+class HasStep(Protocol):
+    """Any training state: it holds the number of steps done."""
 
     @property
     def step(self) -> Int[Array, ""]: ...
 
 
 class TrainState(eqx.Module):
-    """Tracer, optimiser state, number of steps done, and the key from which every step's own key is folded.
+    """Model, optimiser state, number of steps done, and the key from which the key of each step is folded.
 
-    `model` is what is learned: the tracer, alone or in a `JointModel`.
+    `model` is the tracer, alone or in a `JointModel`.
     """
 
     model: AbstractTracer | JointModel
@@ -41,7 +41,7 @@ class TrainState(eqx.Module):
         learnable = eqx.filter(model, eqx.is_inexact_array)
         if not jax.tree.leaves(learnable):
             raise ValueError(
-                f"{type(model).__name__} holds no learnable array, so there is nothing to train. Evaluate it as it is."
+                f"{type(model).__name__} holds no learnable array, so there is nothing to train. Evaluate it without training."
             )
         return cls(model, optimizer.init(learnable), jnp.zeros((), jnp.int32), jax.random.PRNGKey(seed))
 
@@ -50,5 +50,5 @@ class TrainState(eqx.Module):
         return self.model.tracer if isinstance(self.model, JointModel) else self.model
 
     def step_key(self) -> UInt32[Array, " 2"]:
-        """The key of the step about to be done: a function of seed and step only, so that resuming is exact."""
+        """The key of the next step: a function of seed and step only, so that resuming is exact."""
         return jax.random.fold_in(self.key, self.step)

@@ -1,6 +1,5 @@
-"""Tables of results that are made again from their recipes: measured, kept as JSON, and written into their pages.
+"""Tables of results that are reproduced from their recipes: measured, stored as JSON, and written into their pages.
 
-`recipe` says what a table holds, `measure` simulates, traces and scores, `interval` gives confidence intervals,
-`provenance` says which code a table was made with and whether that has changed since, `table` writes the JSON and
-`markdown` the pages.
+`recipe` defines a table, `measure` simulates, traces and scores, `interval` computes confidence intervals, `provenance`
+records the code that a table was made with and detects changes, `table` writes the JSON and `markdown` the pages.
 """

@@ -1,4 +1,4 @@
-"""Means over frames with confidence intervals by recording: recordings are drawn anew, frames of one belong together."""
+"""Means over frames with confidence intervals by recording: a bootstrap that resamples whole recordings."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ SEED = 0
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """A mean over the frames (or tags) of all recordings. None is what cannot be said."""
+    """A mean over the frames (or tags) of all recordings. None stands for an undefined value."""
 
     value: float | None
-    low: float | None  # ends of the interval: None with fewer than two recordings that have such a frame
+    low: float | None  # bounds of the interval; None with fewer than two recordings that have such a frame
     high: float | None
     total: float
     count: int
@@ -26,10 +26,10 @@ class Estimate:
 
 
 def ratio_estimate(totals: Float[np.ndarray, " recording"], counts: Int[np.ndarray, " recording"]) -> Estimate:
-    """sum(totals) / sum(counts), one element a recording, with its percentile bootstrap interval.
+    """sum(totals) / sum(counts), one element per recording, with its percentile bootstrap interval.
 
-    The interval holds the middle 95 % of the values that 2,000 draws of as many recordings, with replacement, give. Always
-    the same draws: the same recordings have the same interval. Recordings with a count of 0 are left out.
+    The interval covers the central 95 % of the values of 2,000 resamples of the recordings with replacement. The seed is
+    fixed, so the same recordings always give the same interval. Recordings with a count of 0 are left out.
     """
     total, count = totals[counts > 0], counts[counts > 0]
     if not len(count):

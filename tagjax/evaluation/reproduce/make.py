@@ -1,4 +1,4 @@
-"""Make a table from its recipe: measure it, write its JSON, and put it into its pages. Simulating needs the sim extra."""
+"""Make a table from its recipe: measure it, write its JSON, and write it into its pages. Simulating needs the sim extra."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def make_table(
 ) -> dict[str, Any]:
     """Measure a table, write it to docs/tables below `root` and into its pages, and return it.
 
-    `suites` and `tracers` are the settings that the recipe names (`Recipe.suites`, `Recipe.tracers`). Suites lie in
-    `recordings`, where what is missing is simulated by `workers` processes; scores of each recording that has been traced
-    are kept in `finished`, so that the next call goes on after an interruption.
+    `suites` and `tracers` are the settings that the recipe names (`Recipe.suites`, `Recipe.tracers`). The
+    recordings of suites are in the folder `recordings`; missing ones are simulated by `workers` processes. Scores of each
+    traced recording are stored in `finished`, so that the next call resumes after an interruption.
     """
     begun = begin(recipe, root)
     inputs = Inputs(suites, tracers, recordings, finished, begun["depends"], workers)

@@ -1,19 +1,19 @@
-"""A table as Markdown between the markers of its pages. What is written follows from the table's JSON alone."""
+"""A table as Markdown between the markers of its pages. The text is a function of the table's JSON alone."""
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ...core.files import write_atomic
 from .recipe import COUNTS, Recipe
 from .table import command, read_table, table_path
 
 
 def rendered(table: Mapping[str, Any]) -> str:
-    """The table, and below it the command, revision, date and machine that it was made by, and what was recorded by hand."""
+    """The table, and below it its command, revision, date and machine, and the sources of values recorded by hand."""
     columns = table["columns"]
     lines = ["| | " + " | ".join(column["heading"] for column in columns) + " |", "|" + "---|" * (len(columns) + 1)]
     for row in table["rows"]:
@@ -31,29 +31,29 @@ def rendered(table: Mapping[str, Any]) -> str:
 
 
 def not_made(name: str) -> str:
-    """What stands between the markers of a table that has not been made."""
+    """The text between the markers of a table that has not been made."""
     return f"*This table has not been made yet: `{command(name)}`.*"
 
 
 def replaced(text: str, name: str, body: str) -> str:
-    """The text of a page with `body` between a table's markers. Raises `ValueError` where they are missing or doubled."""
+    """The text of a page with `body` between a table's markers. Raises `ValueError` where they are missing or repeated."""
     head, _, tail = _parts(text, name)
     return f"{head}\n{body}\n{tail}"
 
 
 def pages(recipe: Recipe, root: Path) -> dict[Path, tuple[str, str]]:
-    """What stands in each page of a table, and what should by its JSON. Raises `ValueError` for missing markers."""
+    """The present text of each page of a table, and the text according to its JSON. Raises `ValueError` for missing markers."""
     table = read_table(table_path(root, recipe.name))
     body = not_made(recipe.name) if table is None else rendered(table)
-    found = {}
+    texts = {}
     for name in recipe.pages:
         path = root / name
         try:
             before = path.read_text(encoding="utf-8")
-            found[path] = before, replaced(before, recipe.name, body)
+            texts[path] = before, replaced(before, recipe.name, body)
         except (OSError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
-    return found
+    return texts
 
 
 def differing(recipe: Recipe, root: Path) -> list[Path]:
@@ -62,13 +62,11 @@ def differing(recipe: Recipe, root: Path) -> list[Path]:
 
 
 def write_pages(recipe: Recipe, root: Path) -> list[Path]:
-    """Put the table of the JSON into its pages; those that this changed."""
+    """Write the table of the JSON into its pages; returns the pages that changed."""
     changed = []
     for path, (before, after) in pages(recipe, root).items():
         if before != after:
-            beside = path.with_name(f"{path.name}.part")
-            beside.write_text(after, encoding="utf-8")
-            os.replace(beside, path)
+            write_atomic(path, after)
             changed.append(path)
     return changed
 
@@ -89,17 +87,17 @@ def _cell(cell: Mapping[str, Any] | None, column: Mapping[str, Any]) -> str:
         return ""
     if cell["kind"] == "recorded":
         return _escaped(cell["text"] if cell["paper"] is None else f"{cell['text']} ({cell['paper']})")
-    found = []
+    parts = []
     for number, measure in enumerate(column["measures"]):
         if measure in COUNTS:
-            found.append(f"{cell[measure]:,}")
+            parts.append(f"{cell[measure]:,}")
             continue
         value = cell["values"][measure]
         text = _number(measure, value["value"], value)
         if number == 0 and column["interval"] and value["low"] is not None:
             text += f" [{_plain_number(measure, value['low'])}, {_plain_number(measure, value['high'])}]"
-        found.append(text)
-    return " / ".join(found)
+        parts.append(text)
+    return " / ".join(parts)
 
 
 def _number(measure: str, value: float | None, whole: Mapping[str, Any]) -> str:
@@ -125,7 +123,7 @@ def _made_by(table: Mapping[str, Any]) -> str:
 
 
 def _recorded_notes(table: Mapping[str, Any]) -> list[str]:
-    """One sentence on rows recorded by hand: at which revisions and dates they were measured."""
+    """One sentence with the revisions and dates of rows recorded by hand."""
     sources = dict.fromkeys(
         f"revision `{cell['revision'][:10]}`, {cell['date']}"
         for row in table["rows"]
@@ -135,9 +133,9 @@ def _recorded_notes(table: Mapping[str, Any]) -> list[str]:
     if not sources:
         return []
     where = f"conf/table/{table['name']}.yaml"
-    return [f"\\* Recorded by hand, not made by this command: {'; '.join(sources)}; the commands stand in `{where}`."]
+    return [f"\\* Recorded by hand, not made by this command: {'; '.join(sources)}; the commands are in `{where}`."]
 
 
 def _escaped(text: str) -> str:
-    """A cell's text: a bar within it would begin another cell."""
+    """A cell's text with escaped bars, which would start another cell."""
     return re.sub(r"(?<!\\)\|", r"\\|", text)

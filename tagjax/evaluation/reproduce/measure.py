@@ -1,4 +1,4 @@
-"""Measure what a table needs: simulate the recordings that are missing, trace each, and keep its scores as soon as it is done."""
+"""Measure the scores of a table: simulate missing recordings, trace each one, and store its scores immediately."""
 
 from __future__ import annotations
 
@@ -18,54 +18,54 @@ from ...sim.suites import Item, Suite, make_items
 from ...tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
-from ...training.run import parameters
+from ...training.evaluate import parameters
 from .recipe import Job, Recipe
 from .scores import RecordingScores
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with what is being done, how many recordings are done, and of how many."""
+"""Called with a description of the current work, the number of finished recordings, and their total number."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Inputs:
-    """What a recipe only names, and where things lie: settings of suites and tracers by name, and folders."""
+    """The settings of suites and tracers by name, to which a recipe refers, and the folders."""
 
     suites: Mapping[str, Mapping[str, Any]]
     tracers: Mapping[str, Mapping[str, Any]]
-    recordings: Path  # of the suites, simulated where they are missing
-    finished: Path  # scores of recordings that have been traced, by what they follow from
-    code: Mapping[str, str]  # blob ids of the files that the scores follow from
+    recordings: Path  # folder of the suites' recordings; missing ones are simulated
+    finished: Path  # folder of the scores of traced recordings, by the hash of what determines them
+    code: Mapping[str, str]  # blob ids of the files that determine the scores
     workers: int = 1  # processes that simulate
 
 
 def measure(
     recipe: Recipe, inputs: Inputs, *, on_progress: OnProgress | None = None
 ) -> dict[Job, list[RecordingScores]]:
-    """The scores of every job of a recipe, one element a recording.
+    """The scores of every job of a recipe, one element per recording.
 
-    Recordings that were traced before, by the same code with the same settings, are not traced again: after an
-    interruption all but the one that was being traced are there. Raises `ConfigError` for a suite or tracer that
-    `inputs` does not hold, and for a split without recordings.
+    Recordings that were traced before, by the same code with the same settings, are not traced again; an interruption
+    loses only the recording in progress. Raises `ConfigError` for a suite or tracer that is not in `inputs`, and for a
+    split without recordings.
     """
     report = on_progress or (lambda what, done, total: None)
     jobs = recipe.jobs()
-    tracings = {job: _tracing(recipe, inputs, job) for job in jobs}  # wrong settings fail before the work
-    items = {draw: _items(inputs, *draw, report) for draw in dict.fromkeys(map(_draw, jobs))}
-    total = sum(len(items[_draw(job)]) for job in jobs)
+    tracings = {job: _tracing(recipe, inputs, job) for job in jobs}  # wrong settings raise before the work starts
+    items = {draw: _items(inputs, *draw, report) for draw in dict.fromkeys(map(_recordings_key, jobs))}
+    total = sum(len(items[_recordings_key(job)]) for job in jobs)
     numbers = itertools.count()
-    found: dict[Job, list[RecordingScores]] = {job: [] for job in jobs}
+    scores: dict[Job, list[RecordingScores]] = {job: [] for job in jobs}
     for draw in items:
         for item in items[draw]:
-            for job in (job for job in jobs if _draw(job) == draw):
+            for job in (job for job in jobs if _recordings_key(job) == draw):
                 report(f"{item.name}: {job.system}", next(numbers), total)
-                found[job].append(tracings[job].scores(item, inputs))
+                scores[job].append(tracings[job].scores(item, inputs))
     report("measured", total, total)
-    return found
+    return scores
 
 
 @dataclasses.dataclass(frozen=True)
 class Tracing:
-    """A tracer with all that its scores on a recording follow from."""
+    """A tracer with all settings that determine its scores on a recording."""
 
     tracer: AbstractTracer
     settings: Mapping[str, Any]
@@ -74,11 +74,11 @@ class Tracing:
     frames: tuple[int, int] | None
 
     def scores(self, item: Item, inputs: Inputs) -> RecordingScores:
-        """The scores of a recording, traced unless they are there from before."""
+        """The scores of a recording, which is traced unless they are stored already."""
         follows_from = self.determinants(item, inputs.code)
         name = hashlib.sha256(json.dumps(follows_from, sort_keys=True).encode()).hexdigest()[:24]
         path = inputs.finished / f"{name}.json"
-        kept = _kept(path, follows_from)
+        kept = _stored(path, follows_from)
         if kept is None:
             kept = RecordingScores.of(self.trace(item.path(inputs.recordings)))
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -98,12 +98,12 @@ class Tracing:
         )
 
     def determinants(self, item: Item, code: Mapping[str, str]) -> dict[str, Any]:
-        """All that the scores follow from, as plain JSON.
+        """All that determines the scores, as plain JSON.
 
-        Settings (.yaml) and learned parameters (.json) count by their values, all other files by their content.
+        Settings (.yaml) and learned parameters (.json) enter by their values, all other files by their content.
         """
         suite = dataclasses.asdict(item.suite)
-        for name in ("about", "paper", "counts", "variants"):  # of other recordings, or words
+        for name in ("about", "paper", "counts", "variants"):  # about other recordings, or descriptions
             del suite[name]
         everything = {
             "recording": {"suite": suite, "variant": dataclasses.asdict(item.variant), "seed": item.seed},
@@ -119,7 +119,7 @@ class Tracing:
 
 def _tracing(recipe: Recipe, inputs: Inputs, job: Job) -> Tracing:
     system, protocol = recipe.systems[job.system], recipe.protocols[job.protocol]
-    settings = _named("tracer", system.tracer, inputs.tracers)
+    settings = _settings_by_name("tracer", system.tracer, inputs.tracers)
     scores = changed(ScoreSettings(num_pictures=0), {**protocol.scores, **system.scores}, where="scores")
     if system.weights is None:
         tracer, clips = make_tracer(settings), tracer_clips(settings)
@@ -129,43 +129,43 @@ def _tracing(recipe: Recipe, inputs: Inputs, job: Job) -> Tracing:
     return Tracing(tracer, settings, clips, scores, protocol.frames)
 
 
-def _draw(job: Job) -> tuple[str, str, tuple[int, ...] | None]:
-    """Which recordings a job is of."""
+def _recordings_key(job: Job) -> tuple[str, str, tuple[int, ...] | None]:
+    """Suite, split and seeds of a job's recordings."""
     return job.suite, job.split, job.seeds
 
 
 def _items(inputs: Inputs, name: str, split: str, seeds: Sequence[int] | None, report: OnProgress) -> list[Item]:
-    """The recordings of a suite's split, drawn with each of the seeds, simulated where they are missing."""
-    own = from_mapping(Suite, _named("suite", name, inputs.suites), where=f"suite {name}")
+    """The recordings of a suite's split with each of the seeds, simulated where they are missing."""
+    own = from_mapping(Suite, _settings_by_name("suite", name, inputs.suites), where=f"suite {name}")
     suites = [own]
     if seeds is not None:
         suites = [dataclasses.replace(own, name=f"{own.name}-seed{seed}", seed=seed) for seed in seeds]
-    found: list[Item] = []
+    recordings: list[Item] = []
     for suite in suites:
         items = [item for item in suite.items() if item.split == split]
-        there = sum(item.path(inputs.recordings).exists() for item in items)
-        report(f"simulate {suite.name}", there, len(items))
-        done, num = itertools.count(there + 1), len(items)
-        found += make_items(
+        num_existing = sum(item.path(inputs.recordings).exists() for item in items)
+        report(f"simulate {suite.name}", num_existing, len(items))
+        done, num = itertools.count(num_existing + 1), len(items)
+        recordings += make_items(
             suite,
             inputs.recordings,
             splits=(split,),
             workers=inputs.workers,
             on_done=lambda one, done=done, num=num: report(f"simulated {one.name}", next(done), num),
         )
-    if not found:
+    if not recordings:
         raise ConfigError(f"suite {name}: found no {split} recording; choose another split, or raise its counts.")
-    return found
+    return recordings
 
 
-def _named(kind: str, name: str, known: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
+def _settings_by_name(kind: str, name: str, known: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
     if name not in known:
         raise ConfigError(f"found {kind} {name!r}; expected one of {', '.join(known) or 'none'}.")
     return known[name]
 
 
-def _kept(path: Path, follows_from: Mapping[str, Any]) -> RecordingScores | None:
-    """Scores from before; None where there are none, or the file is damaged: they can be measured again."""
+def _stored(path: Path, follows_from: Mapping[str, Any]) -> RecordingScores | None:
+    """Stored scores; None where there are none or the file is damaged, so that they are measured again."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["follows_from"] != follows_from:

@@ -1,4 +1,4 @@
-"""Which files a table follows from, at which revision they were, and whether they have changed since."""
+"""The files that determine a table, their revision, and whether they have changed since."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from typing import Any
 
 
 def blob_id(content: bytes) -> str:
-    """The name that Git gives to a file of this content (`git hash-object`)."""
+    """Git's id of a file with this content (`git hash-object`)."""
     return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
 
 
 def dependencies(root: Path, patterns: Iterable[str]) -> dict[str, str]:
     """The blob ids of the files that the patterns match below `root`, by path from there.
 
-    Raises `ValueError` for a pattern that matches none: a table would not notice when that file changes.
+    Raises `ValueError` for a pattern that matches none: otherwise a change of that file would not be detected.
     """
-    found: dict[str, str] = {}
+    files: dict[str, str] = {}
     for pattern in patterns:
         paths = [path for path in root.glob(pattern) if path.is_file() and "__pycache__" not in path.parts]
         if not paths:
             raise ValueError(
                 f"depends: {pattern!r} matches no file in {root}; correct it or take it out of the recipe."
             )
-        found |= {path.relative_to(root).as_posix(): blob_id(path.read_bytes()) for path in paths}
-    return dict(sorted(found.items()))
+        files |= {path.relative_to(root).as_posix(): blob_id(path.read_bytes()) for path in paths}
+    return dict(sorted(files.items()))
 
 
 def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Why a table is stale: each file of which the blob id differs, and those that came or went."""
+    """Why a table is stale: each file with another blob id, and each added or removed file."""
     words = {(True, True): "changed", (True, False): "removed", (False, True): "added"}
     return [
         f"{path} ({words[path in before, path in now]})"
@@ -41,9 +41,9 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def revision(root: Path, files: Mapping[str, str]) -> dict[str, Any]:
-    """The Git commit that is checked out, and which of the files are not as they are in it (None outside of a repository).
+    """The current Git commit, and which of the files differ from it (None outside of a repository).
 
-    Other files do not matter, so that a table that was written before does not count as a change.
+    Other files are ignored, so that a table written before does not count as a change.
     """
     commit = _git(root, "rev-parse", "HEAD")
     listed = None if commit is None else _git(root, "ls-tree", "-r", "-z", "--full-tree", "HEAD")
@@ -56,7 +56,7 @@ def revision(root: Path, files: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _git(root: Path, *words: str) -> str | None:
-    """What a Git command prints; None where there is no Git or no repository."""
+    """The output of a Git command; None without Git or a repository."""
     try:
         done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, check=False)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The recipe of a table: its rows and columns, what is measured for each cell, and the files that the values follow from.
+"""The recipe of a table: its rows and columns, what is measured for each cell, and the files that determine the values.
 
 A recipe is plain settings (conf/table/<name>.yaml). Nothing in it is executed: what can be measured is a score of a suite
 (`kind: score`), and what cannot be measured from a simulated suite is written by hand with its source (`kind: recorded`).
@@ -20,18 +20,17 @@ Kind = Literal["score", "recorded"]
 Split = Literal["train", "validation", "test"]
 
 COUNTS = ("num_recordings", "num_tags", "num_frames")
-"""Measures that only count what a cell's scores are the mean of."""
+"""Measures that count the items over which a cell's scores are averaged."""
 
 MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "false_detections", *COUNTS)
-"""What a column can show: scores of `tagjax.metrics.tracking.Scores`, `locked` (of all tags), and counts."""
+"""Measures that a column can show: scores of `tagjax.metrics.tracking.Scores`, `locked` (of all tags), and counts."""
 
 
 @dataclasses.dataclass(frozen=True)
 class System:
-    """A tracer as it is measured.
+    """A tracer with its settings for the measurement.
 
-    `clips` holds what differs from the clips of the weights or of the tracer's settings, `scores` what differs from the
-    protocol.
+    `clips` overrides the clip settings of the weights or of the tracer, `scores` those of the protocol.
     """
 
     tracer: str  # the name of its settings in conf/tracer
@@ -46,7 +45,7 @@ class System:
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """Which frames of a recording are traced (all if None), and which count: what differs from `ScoreSettings`."""
+    """Which frames of a recording are traced (all if None), and which are scored; `scores` overrides `ScoreSettings`."""
 
     frames: tuple[int, int] | None = None
     scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -59,7 +58,7 @@ class Protocol:
 
 @dataclasses.dataclass(frozen=True)
 class Recorded:
-    """A value written by hand, with the command, revision and date that it was measured by, or the paper that gives it."""
+    """A value written by hand, with the command, revision and date of its measurement, or its source in a paper."""
 
     text: str
     command: str | None = None
@@ -72,7 +71,7 @@ class Recorded:
         if None in measured if self.paper is None else any(measured):
             raise ConfigError(
                 f"{self.text!r}: found command {self.command}, revision {self.revision}, date {self.date}, paper {self.paper}; "
-                "expected the first three (a value measured here), or paper alone (a value that a paper gives)."
+                "expected the first three (a value measured here), or paper alone (a value from a paper)."
             )
 
 
@@ -97,9 +96,9 @@ class Row:
     kind: Kind = "score"
     suite: str | None = None
     split: Split = "test"
-    seeds: tuple[int, ...] | None = None  # the suite's recordings drawn with these seeds together; its own seed if None
+    seeds: tuple[int, ...] | None = None  # the suite's recordings with all of these seeds; the suite's own seed if None
     protocol: str | None = None
-    system: str | Mapping[str, str] | None = None  # of all columns, or by the name of the column
+    system: str | Mapping[str, str] | None = None  # for all columns, or by the name of the column
     recorded: Mapping[str, Recorded] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -111,7 +110,7 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """What a cell's scores are measured on and by: every recording of a suite's split, under a protocol, by a system."""
+    """The measurement of a cell's scores: every recording of a suite's split, under a protocol, by a system."""
 
     suite: str
     split: str
@@ -121,14 +120,14 @@ class Job:
 
     @property
     def name(self) -> str:
-        """A name for people and for the JSON."""
+        """A readable name, also used in the JSON."""
         seeds = "" if self.seeds is None else f"/seeds {', '.join(map(str, self.seeds))}"
         return f"{self.suite}/{self.split}{seeds}/{self.protocol}/{self.system}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Everything that a table follows from, except for the files that `depends` names."""
+    """Everything that determines a table, except for the files in `depends`."""
 
     name: str
     title: str
@@ -152,8 +151,8 @@ class Recipe:
                 self._check(f"row {row.label!r}: protocol", [row.protocol], self.protocols)
                 by_column = row.system if isinstance(row.system, Mapping) else {}
                 self._check(f"row {row.label!r}: system", by_column, self.columns)
-                named = by_column.values() if by_column else [row.system] if row.system else []
-                self._check(f"row {row.label!r}: system", named, self.systems)
+                systems = by_column.values() if by_column else [row.system] if row.system else []
+                self._check(f"row {row.label!r}: system", systems, self.systems)
 
     @staticmethod
     def _check(where: str, found: Any, known: Mapping[str, Any]) -> None:
@@ -161,7 +160,7 @@ class Recipe:
             raise ConfigError(f"{where}: found {', '.join(unknown)}; expected some of {', '.join(known) or 'none'}.")
 
     def job(self, row: Row, column: str) -> Job | None:
-        """What the cell of a row and a column needs measured; None for a recorded or an empty cell."""
+        """The measurement for the cell of a row and a column; None for a recorded or an empty cell."""
         system = row.system.get(column) if isinstance(row.system, Mapping) else row.system
         if row.suite is None or row.protocol is None or system is None or column in row.recorded:
             return None
@@ -170,14 +169,14 @@ class Recipe:
         return Job(row.suite, row.split, row.seeds, row.protocol, system)
 
     def jobs(self) -> list[Job]:
-        """What is to be measured, each once, in the order of the table."""
-        found = [self.job(row, column) for row in self.rows for column in self.columns]
-        return list(dict.fromkeys(job for job in found if job is not None))
+        """All measurements without duplicates, in the order of the table."""
+        jobs = [self.job(row, column) for row in self.rows for column in self.columns]
+        return list(dict.fromkeys(job for job in jobs if job is not None))
 
     def suites(self) -> list[str]:
-        """Names of the suites that are measured on."""
+        """Names of the suites of all measurements."""
         return list(dict.fromkeys(job.suite for job in self.jobs()))
 
     def tracers(self) -> list[str]:
-        """Names of the tracers' settings that are measured."""
+        """Names of the tracers' settings of all measurements."""
         return list(dict.fromkeys(self.systems[job.system].tracer for job in self.jobs()))

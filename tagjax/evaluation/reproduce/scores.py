@@ -12,7 +12,7 @@ from ...metrics.recordings import RecordingResult
 
 @dataclasses.dataclass(frozen=True)
 class RecordingScores:
-    """The scores of one recording: for each measure the sum over its frames (or tags), and of how many."""
+    """The scores of one recording: for each measure the sum over its frames (or tags), and their number."""
 
     name: str
     num_tags: int
@@ -21,7 +21,7 @@ class RecordingScores:
 
     @classmethod
     def of(cls, result: RecordingResult) -> RecordingScores:
-        """What a traced recording scores."""
+        """The scores of a traced recording."""
         scores = result.scores()
         num_locked = int(np.sum(np.isfinite(scores.lock_s)))
         sums = {name: (mean.total, mean.count) for name, mean in scores.means.items()}

@@ -1,4 +1,4 @@
-"""What is wrong with a table: stale since which change, or not what its pages show."""
+"""The state of a table: stale because of which changes, or different from the text of its pages."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from .provenance import changes, dependencies
 from .recipe import Recipe
 from .table import command, read_table, table_path
 
-_SHOWN = 5
-"""So many changed files are named; of more, only the number is given."""
+_MAX_LISTED = 5
+"""Up to this many changed files are listed; of the others only the number is given."""
 
 
 def stale(recipe: Recipe, root: Path) -> list[str]:
-    """Why a table is to be made again: it was never made, or which files changed since. Empty for one that is up to date."""
+    """Why a table must be made again: it was never made, or which files changed. Empty for a table that is up to date."""
     table = read_table(table_path(root, recipe.name))
     if table is None:
         return ["not made yet"]
@@ -22,14 +22,16 @@ def stale(recipe: Recipe, root: Path) -> list[str]:
 
 
 def status(recipe: Recipe, root: Path) -> list[str]:
-    """What is wrong with a table and what to do, a line each; empty where nothing is."""
-    found = []
+    """Problems of a table and what to do, one line each; empty where there is none."""
+    problems = []
     if reasons := stale(recipe, root):
-        more = f" and {len(reasons) - _SHOWN} more" if len(reasons) > _SHOWN else ""
-        found.append(f"{recipe.name} is stale: {', '.join(reasons[:_SHOWN])}{more}. Run `{command(recipe.name)}`.")
-    found += [
+        more = f" and {len(reasons) - _MAX_LISTED} more" if len(reasons) > _MAX_LISTED else ""
+        problems.append(
+            f"{recipe.name} is stale: {', '.join(reasons[:_MAX_LISTED])}{more}. Run `{command(recipe.name)}`."
+        )
+    problems += [
         f"{recipe.name}: {path.relative_to(root)} does not show the table of its JSON. "
         f"Run `{command(recipe.name)} render=true`."
         for path in differing(recipe, root)
     ]
-    return found
+    return problems

@@ -27,12 +27,12 @@ def command(name: str) -> str:
 
 
 def table_path(root: Path, name: str) -> Path:
-    """Where a table lies as JSON."""
+    """The path of a table's JSON."""
     return root / "docs" / "tables" / f"{name}.json"
 
 
 def begin(recipe: Recipe, root: Path) -> dict[str, Any]:
-    """What is known of a table before it is measured: name, command, revision, date, machine, and files it depends on."""
+    """The metadata of a table before it is measured: name, command, revision, date, machine, and files it depends on."""
     files = dependencies(root, recipe.depends)
     return {
         "format": FORMAT,
@@ -49,7 +49,7 @@ def begin(recipe: Recipe, root: Path) -> dict[str, Any]:
 
 
 def filled(begun: Mapping[str, Any], recipe: Recipe, scores: Mapping[Job, Sequence[RecordingScores]]) -> dict[str, Any]:
-    """The whole table as plain values: what `begin` knew, columns, rows with their cells, and scores by recording."""
+    """The whole table as plain values: its metadata from `begin`, columns, rows with their cells, and scores by recording."""
     columns = [
         {"name": name, "heading": column.heading, "measures": list(column.measures), "interval": column.interval}
         for name, column in recipe.columns.items()
@@ -62,7 +62,7 @@ def filled(begun: Mapping[str, Any], recipe: Recipe, scores: Mapping[Job, Sequen
         }
         for row in recipe.rows
     ]
-    by_job = {job.name: [dataclasses.asdict(one) for one in found] for job, found in scores.items()}
+    by_job = {job.name: [dataclasses.asdict(one) for one in results] for job, results in scores.items()}
     return {**begun, "columns": columns, "rows": rows, "recordings": by_job}
 
 
@@ -75,15 +75,15 @@ def _cell(
     job = recipe.job(row, name)
     if job is None:
         return None
-    found = scores[job]
-    values = {measure: _estimate(measure, found) for measure in column.measures if measure not in COUNTS}
+    results = scores[job]
+    values = {measure: _estimate(measure, results) for measure in column.measures if measure not in COUNTS}
     return {
         "kind": "score",
         "job": job.name,
         "values": values,
-        "num_recordings": len(found),
-        "num_tags": sum(one.num_tags for one in found),
-        "num_frames": sum(one.num_frames for one in found),
+        "num_recordings": len(results),
+        "num_tags": sum(one.num_tags for one in results),
+        "num_frames": sum(one.num_frames for one in results),
     }
 
 
@@ -95,7 +95,7 @@ def _estimate(measure: str, scores: Sequence[RecordingScores]) -> dict[str, Any]
 
 
 def write_table(path: Path, table: Mapping[str, Any]) -> None:
-    """Write a table; the file is there whole or as it was."""
+    """Write a table atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, table)
 

@@ -1,4 +1,4 @@
-"""The systems that are compared, each with what it needs of a recording's site: a calibrated camera, a tag grid."""
+"""The compared systems, each with the calibration that it needs: of a camera, or of antennas by a tag grid."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from ...tracing.tracer import AbstractTracer, Trace
 Traces = Iterator[tuple[int, Trace]]
 
 NAMES = ("tagattention", "tagattention_paper", "tagvision", "tagview", "goller")
-"""TagAttention with what is learnable, to the letter of its paper, and its three forerunners."""
+"""TagAttention as it is learned here, TagAttention as its paper describes it, and the three systems before it."""
 
 TABLE = "tabletop"
-"""The story of things that move on one plane, below the camera."""
+"""The story of objects that move on a table below the camera."""
 
 DEVICE = NAMES[:2]
-"""Those that run compiled, on clips."""
+"""The systems that run compiled, on clips."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SystemSettings:
-    """The settings of every system. TagAttention has several, by name; which a suite takes follows from its story."""
+    """The settings of every system. TagAttention has several settings by name; a suite's story selects one of them."""
 
     tagattention: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # as under conf/tracer
-    settings_of: Mapping[str, str] = dataclasses.field(default_factory=dict)  # story to a name in `tagattention`
+    settings_of: Mapping[str, str] = dataclasses.field(default_factory=dict)  # name in `tagattention`, by story
     tagattention_paper: Mapping[str, Any] = dataclasses.field(
         default_factory=dict
     )  # on the same clips as `tagattention`
@@ -49,20 +49,20 @@ class SystemSettings:
     tagvision_calibration: CalibrationSettings = dataclasses.field(default_factory=CalibrationSettings)
     tagview: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
     goller: GollerSettings = dataclasses.field(default_factory=GollerSettings)
-    goller_calibration: str | None = None  # calibration.json of experiments.goller, whose widths and rates are fitted
-    goller_grid: str | None = None  # else: recording of a tag on a grid, which calibrates its antennas and nothing more
+    goller_calibration: str | None = None  # calibration.json of experiments.goller, with fitted widths and rates
+    goller_grid: str | None = None  # otherwise: recording of a tag grid, from which only the antennas are calibrated
 
     def __post_init__(self) -> None:
         if unknown := sorted(set(self.settings_of.values()) - set(self.tagattention)):
             raise ConfigError(
-                f"settings_of names {', '.join(unknown)}; TagAttention's settings are {', '.join(self.tagattention)}."
+                f"settings_of: found {', '.join(unknown)}; expected settings of TagAttention, some of {', '.join(self.tagattention)}."
             )
 
 
 class Systems:
-    """Makes each system's traces of a recording; what cannot be applied raises `RecordingError` with the reason.
+    """Computes each system's traces of a recording.
 
-    Raises `ConfigError` where `goller_calibration` names none.
+    Raises `ConfigError` where `goller_calibration` is not a calibration.
     """
 
     def __init__(self, settings: SystemSettings, scores: ScoreSettings):
@@ -75,55 +75,55 @@ class Systems:
                 raise ConfigError(f"systems.goller_calibration: {error}") from error
         self._tracers: dict[tuple[str, str | None], AbstractTracer] = {}
 
-    def chosen(self, name: str, item: Item) -> str | None:
-        """Which of TagAttention's settings a recording takes, by the story that it tells; None for other systems.
+    def settings_name(self, name: str, item: Item) -> str | None:
+        """The name of TagAttention's settings for a recording, by its story; None for other systems.
 
-        Raises `ConfigError` for a story that `settings_of` does not name.
+        Raises `ConfigError` for a story that is not in `settings_of`.
         """
         if name not in DEVICE:
             return None
         story = item.variant.story or item.suite.story
         if story not in self.settings.settings_of:
             raise ConfigError(
-                f"{item.suite.name} tells {story!r}: systems.settings_of does not say which of TagAttention's settings suit "
-                f"it; they are {', '.join(self.settings.tagattention)}."
+                f"{item.suite.name}: found no entry for the story {story!r} in systems.settings_of; expected one of TagAttention's "
+                f"settings, {', '.join(self.settings.tagattention)}."
             )
         return self.settings.settings_of[story]
 
-    def taken(self, name: str, item: Item) -> str | None:
-        """Which of a system's settings a recording takes, to be told; None for a system that has one only."""
+    def settings_label(self, name: str, item: Item) -> str | None:
+        """The settings that a system uses for a recording, as tables show it; None for a system with one setting only."""
         if name == "goller":
             return "starting widths" if self.settings.goller_calibration is None else "fitted widths"
-        return self.chosen(name, item)
+        return self.settings_name(name, item)
 
     def stride(self, name: str, item: Item) -> int:
-        """Every how many pixels a system's masks have one."""
-        way = self.chosen(name, item)
-        return 1 if way is None else tracer_clips(self.settings.tagattention[way]).stride
+        """The stride in pixels of a system's masks."""
+        settings_name = self.settings_name(name, item)
+        return 1 if settings_name is None else tracer_clips(self.settings.tagattention[settings_name]).stride
 
     def traces(self, name: str, item: Item, recording: Recording, epcs: list[str]) -> Traces:
         """Frame numbers and traces. Raises `RecordingError` or `ValueError` where the method cannot apply."""
-        way = self.chosen(name, item)
-        if way is not None:
-            return self._device(name, way, recording, epcs)
+        settings_name = self.settings_name(name, item)
+        if settings_name is not None:
+            return self._device(name, settings_name, recording, epcs)
         make: dict[str, Callable[[], Any]] = {
             "tagvision": lambda: self._tagvision(item, recording),
             "tagview": lambda: self._tagview(item, recording),
             "goller": lambda: self._goller(recording),
         }
         if name not in make:
-            raise ConfigError(f"Unknown system {name!r}; expected some of {', '.join(NAMES)}.")
+            raise ConfigError(f"found system {name!r}; expected one of {', '.join(NAMES)}.")
         tracer = make[name]()
         reason = tracer.inapplicable(recording)
         if reason is not None:
             raise RecordingError(reason)
         return host_trace(tracer, recording, epcs=epcs)
 
-    def _device(self, name: str, way: str, recording: Recording, epcs: list[str]) -> Traces:
-        settings, paper = self.settings.tagattention[way], name == "tagattention_paper"
+    def _device(self, name: str, settings_name: str, recording: Recording, epcs: list[str]) -> Traces:
+        settings, paper = self.settings.tagattention[settings_name], name == "tagattention_paper"
         clips = tracer_clips(settings)
         clips = dataclasses.replace(clips, estimator="paper") if paper else clips
-        key = name, None if paper else way
+        key = name, None if paper else settings_name
         if key not in self._tracers:
             self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings)
         tracer = self._tracers[key]
@@ -132,22 +132,22 @@ class Systems:
         )
 
     def _plane(self, item: Item, recording: Recording) -> PlaneCamera:
-        """The camera as it was calibrated on the table, which both TagVision and Tagview take."""
+        """The simulated calibration of the camera over the table, which both TagVision and Tagview use."""
         truth = table_truth(item, recording)
         return simulate_calibration(truth.camera, truth.area_m, self.settings.tagvision_calibration)
 
     def _tagvision(self, item: Item, recording: Recording) -> TagVisionTracer:
         if item.suite.story != TABLE:
-            raise RecordingError("no calibrated plane: things do not move on one")
+            raise RecordingError("no calibrated plane: the objects do not move on one plane")
         return TagVisionTracer(self._plane(item, recording), self.settings.tagvision)
 
     def _tagview(self, item: Item, recording: Recording) -> TagviewTracer:
         settings = self.settings.tagview
         if item.suite.story != TABLE:
-            raise RecordingError("the camera does not look straight down on a plane that things move on")
+            raise RecordingError("the camera does not look straight down on a plane on which the objects move")
         if settings.height_m is None:
-            over_m = float(self._plane(item, recording).position_m[2]) - self.settings.tagvision.height_m
-            settings = dataclasses.replace(settings, height_m=over_m)
+            height_m = float(self._plane(item, recording).position_m[2]) - self.settings.tagvision.height_m
+            settings = dataclasses.replace(settings, height_m=height_m)
         return TagviewTracer(settings)
 
     def _goller(self, recording: Recording) -> GollerTracer:
@@ -157,7 +157,7 @@ class Systems:
             grid = self.settings.goller_grid
             if grid is None or not Path(grid).exists():
                 raise RecordingError(
-                    f"antennas not calibrated: systems.goller_grid names no recording of a tag grid ({grid}); "
+                    f"antennas not calibrated: found no recording of a tag grid at systems.goller_grid={grid}; "
                     "`python -m experiments.simulate suite=shop_grid` makes one"
                 )
             self._calibration = calibrate(open_recording(Path(grid)))

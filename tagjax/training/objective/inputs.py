@@ -1,4 +1,4 @@
-"""What the objective looks at: its settings, and a clip with what the tracer made of it."""
+"""The inputs of the objective: its settings, and a clip with the tracer's estimates."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from ...radio.reads import PhaseReads
 from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace, trace
 
 TERM_NAMES = ("contrast", "coverage", "area", "compactness", "steadiness", "calibration")
-"""The terms of the objective, each with its weight among the settings."""
+"""Names of the objective's terms; the settings hold a weight of each name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectiveSettings:
-    """Weights of the terms and what they look at. Terms of weight 0 are not computed."""
+    """Weights and parameters of the terms. Terms of weight 0 are not computed."""
 
     contrast: float = 1.0
     coverage: float = 0.3
-    area: float = 0.0  # weak priors, which know nothing of the tag: of the mask's share of the picture,
-    compactness: float = 0.0  # of its spread in 3D, m^2,
-    steadiness: float = 0.0  # and of what changes of it along the flow
-    calibration: float = 0.0  # of the confidence: how often a mask's motion does explain the reads best
+    area: float = 0.0  # weak priors, independent of the tag: on the fraction of the picture that the mask covers,
+    compactness: float = 0.0  # on its spatial variance, m^2,
+    steadiness: float = 0.0  # and on its change along the flow
+    calibration: float = 0.0  # of the confidence, as the probability that the mask's motion explains the reads best
     evidence: Literal["coherence", "likelihood"] = "coherence"  # of the contrast
     temperature: float = 0.1  # of the contrast, in units of coherence; of the likelihood in nats
     flip_probability: float = 0.05  # of the likelihood: that a read is off by pi
     num_shifts: int = 4  # time-shifted copies of the own motion among the negatives
-    span_frames: int = 6  # coherence is taken over pieces this long: drift of the sum does not reach further
-    skip_frames: int = 12  # at the start of a clip, while the tracer has not seen enough
-    min_reads: int = 6  # a piece with fewer reads says nothing
-    stationary_margin: float = (
-        0.05  # a piece whose reads, modulo pi, lose less coherence than this by taking the tag to rest is left out
-    )
+    span_frames: int = 6  # length of the pieces that coherence is computed over: drift accumulates within a piece only
+    skip_frames: int = 12  # at the start of a clip, where the tracer has too little evidence
+    min_reads: int = 6  # a piece with fewer reads is left out
+    stationary_margin: float = 0.05  # a piece whose reads, modulo pi, lose less coherence than this if the tag is assumed stationary is left out
     max_reads: int = 384  # reads of one tag in a clip
     num_channels: int = 32  # distinct channels of one tag in a clip; reads of further ones are left out
-    multiple: int = 1  # of the coherence: 2 takes phases modulo pi: right whether the reader flips or not, but ambiguous twice as soon
+    multiple: int = (
+        1  # of the coherence; 2 takes phases modulo pi: unaffected by pi flips, but ambiguous at half the distance
+    )
     future_alpha_m2: float = 1e-3  # a pixel agrees with the future if it is within about the root of this
-    future_stride: int = 2  # every n-th working pixel is asked
+    future_stride: int = 2  # every n-th working pixel is compared
     rematerialise: bool = True  # keep only the tracer's states for the backward pass
-    memory: float = 0.5  # share of the gradient that a frame hands on to the frame before
-    term_norms: bool = False  # log each term's gradient norm: each goes back by itself, three take 1.7 times the time
+    memory: float = 0.5  # fraction of the gradient that a frame passes to the frame before
+    term_norms: bool = False  # log each term's gradient norm; with three terms a step takes 1.7 times the time
 
     def __post_init__(self) -> None:
         if not 0 < self.flip_probability < 1:
@@ -53,28 +53,30 @@ class ObjectiveSettings:
             )
 
     def weights(self) -> dict[str, float]:
-        """The weight of each term that takes part, by name."""
+        """The weight of each term whose weight is not 0, by name."""
         weights = {name: float(getattr(self, name)) for name in TERM_NAMES}
-        taking_part = {name: weight for name, weight in weights.items() if weight != 0.0}
-        if not taking_part:
-            raise ValueError(f"All terms of the objective have weight 0; give one of {', '.join(TERM_NAMES)} a weight.")
-        return taking_part
+        active = {name: weight for name, weight in weights.items() if weight != 0.0}
+        if not active:
+            raise ValueError(
+                f"All terms of the objective have weight 0; expected a weight for at least one of {', '.join(TERM_NAMES)}."
+            )
+        return active
 
 
-class Seen(eqx.Module):
-    """A clip with what the tracer made of it."""
+class ObjectiveInputs(eqx.Module):
+    """A clip with the tracer's estimates and its reads."""
 
     camera: Camera
     frames: Frame
-    said: Trace
+    trace: Trace
     reads: PhaseReads  # (tag, antenna, reads): each read of the clip once
 
 
-class _Trained(AbstractTracer):
-    """A tracer as the backward pass sees it: steps computed again rather than kept, gradients fading into the past.
+class _FadingTracer(AbstractTracer):
+    """A tracer with another backward pass: steps are recomputed rather than stored, and gradients fade into the past.
 
-    A recurrent tracer multiplies gradients from frame to frame; without fading, those of the first frames drown all
-    others. Values are unchanged.
+    A recurrent tracer multiplies gradients from frame to frame; without fading, those of the first frames dominate all
+    others. Values of the forward pass are unchanged.
     """
 
     tracer: AbstractTracer
@@ -99,17 +101,19 @@ class _Trained(AbstractTracer):
         return self.tracer.finish(state)
 
 
-def see(tracer: AbstractTracer, camera: Camera, frames: Frame, settings: ObjectiveSettings) -> Seen:
+def objective_inputs(
+    tracer: AbstractTracer, camera: Camera, frames: Frame, settings: ObjectiveSettings
+) -> ObjectiveInputs:
     """Run the tracer over a clip (leading time axis)."""
-    wrapped = _Trained(tracer, settings.memory, settings.rematerialise)
-    return Seen(camera, frames, trace(wrapped, camera, frames), clip_reads(frames, settings))
+    wrapped = _FadingTracer(tracer, settings.memory, settings.rematerialise)
+    return ObjectiveInputs(camera, frames, trace(wrapped, camera, frames), clip_reads(frames, settings))
 
 
 def clip_reads(frames: Frame, settings: ObjectiveSettings) -> PhaseReads:
     """Each tag's reads of the whole clip by each antenna, (tag, antenna, reads), from the overlapping windows of its frames.
 
-    Of a frame's window only what came after the frame before is new. Channels are numbered anew by first appearance
-    and cut at `num_channels`; of more than `max_reads` reads the newest stay.
+    Of a frame's window only the reads since the frame before are new. Channels are renumbered by first appearance and
+    limited to `num_channels`; of more than `max_reads` reads the newest are kept.
     """
     before = jnp.concatenate([frames.time_s[:1], frames.time_s[:-1]])[:, None, None, None]
     reads = frames.reads

@@ -1,4 +1,4 @@
-"""A whole comparison: suites in (simulated where missing); a table as Markdown, CSV, JSON and a picture out."""
+"""A comparison of systems on suites (simulated where missing); the table is written as Markdown, CSV, JSON and a figure."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.box import SIMPLE
 from rich.table import Table
 from rich.text import Text
 
+from ...core.files import write_atomic
 from ...core.results import write_json
 from ...core.settings import ConfigError, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
@@ -22,19 +23,19 @@ from ...recording.store import open_recording
 from ...report.comparison import bar_plot
 from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_items
 from ...tracing.tracer import Trace
-from ._systems import NAMES, Systems, SystemSettings
-from ._table import LEGEND, MEASURES, SHORT, Cell, bars, markdown, said, write_csv
+from .systems import NAMES, Systems, SystemSettings
+from .table import LEGEND, MEASURES, SHORT_HEADINGS, Cell, bars, format_value, markdown, write_cells
 
-Claims = tuple[np.ndarray, np.ndarray]
-"""Of every tag at one frame: its place in metres (tag, 3), and whether an object is claimed at all (tag,)."""
+Detections = tuple[np.ndarray, np.ndarray]
+"""Of every tag at one frame: its estimated position in metres (tag, 3), and whether it is detected (tag,)."""
 
-_STILL_M = 0.05
-"""A tag that never goes further than this from where it mostly is lies still."""
+_STATIONARY_M = 0.05
+"""A tag that never moves further than this from its median position is stationary."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CompareConfig:
-    """The systems and the suites; `suites` has the settings of each by name, as in the files of conf/suite."""
+    """The systems and the suites; `suites` holds the settings of each suite by name, as in the files of conf/suite."""
 
     suites: Mapping[str, Mapping[str, Any]]
     systems: SystemSettings
@@ -46,7 +47,7 @@ class CompareConfig:
     workers: int = 1
     published: Mapping[str, Mapping[str, str]] = dataclasses.field(
         default_factory=dict
-    )  # figures of the papers, by suite and system
+    )  # results of the papers, by suite and system
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 
     def __post_init__(self) -> None:
@@ -55,10 +56,10 @@ class CompareConfig:
                 "suites is empty; expected names of suites, for example suites=[single_static,planar_tracks]."
             )
         if unknown := sorted(set(self.only) - set(NAMES)):
-            raise ConfigError(f"Unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)}.")
-        if unknown := sorted({name for of in self.published.values() for name in of} - set(NAMES)):
+            raise ConfigError(f"only: found {', '.join(unknown)}; expected some of {', '.join(NAMES)}.")
+        if unknown := sorted({name for systems in self.published.values() for name in systems} - set(NAMES)):
             raise ConfigError(
-                f"published: unknown systems {', '.join(unknown)}; expected some of {', '.join(NAMES)} below each suite."
+                f"published: found {', '.join(unknown)}; expected some of {', '.join(NAMES)} below each suite."
             )
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
@@ -70,12 +71,12 @@ class CompareConfig:
 
 @dataclasses.dataclass
 class _Tally:
-    """What is summed over the recordings of a cell."""
+    """Accumulated results of the recordings of a cell."""
 
     scores: Scores = dataclasses.field(default_factory=Scores)
     error_m: list[np.ndarray] = dataclasses.field(default_factory=list)
-    still: list[np.ndarray] = dataclasses.field(default_factory=list)
-    pace_ms: list[float] = dataclasses.field(default_factory=list)
+    false_alarms: list[np.ndarray] = dataclasses.field(default_factory=list)
+    frame_ms: list[float] = dataclasses.field(default_factory=list)
     num: int = 0
 
 
@@ -83,19 +84,19 @@ def run_comparison(
     config: CompareConfig, folder: Path, *, on_progress: Callable[[str], None] | None = None
 ) -> list[Cell]:
     """Every system on every suite; writes table.md, table.csv, table.json and comparison.png after each suite."""
-    tell = on_progress or (lambda _: None)
+    report = on_progress or (lambda _: None)
     folder.mkdir(parents=True, exist_ok=True)
     systems, cells = Systems(config.systems, config.scores), list[Cell]()
     for name, values in config.suites.items():
-        items = _items(config, from_mapping(Suite, values, where=f"suite {name}"), tell)
+        items = _items(config, from_mapping(Suite, values, where=f"suite {name}"), report)
         for system in config.only:
-            cell = _cell(systems, system, name, items, config, tell)
+            cell = _cell(systems, system, name, items, config, report)
             cells.append(dataclasses.replace(cell, paper=config.published.get(name, {}).get(system)))
         _write(folder, cells)
     return cells
 
 
-def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> list[Item]:
+def _items(config: CompareConfig, suite: Suite, report: Callable[[str], None]) -> list[Item]:
     suite = suite.smoke() if config.smoke else suite
 
     items = make_items(
@@ -104,7 +105,7 @@ def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> 
         splits=(config.split,),
         max_per_variant=config.max_recordings,
         workers=config.workers,
-        on_done=lambda one: tell(f"simulated {one.name}"),
+        on_done=lambda one: report(f"simulated {one.name}"),
     )
     if not items:
         raise ConfigError(f"{suite.name} has no {config.split} recording; choose another split, or raise its counts.")
@@ -112,41 +113,46 @@ def _items(config: CompareConfig, suite: Suite, tell: Callable[[str], None]) -> 
 
 
 def _cell(
-    systems: Systems, system: str, suite: str, items: Sequence[Item], config: CompareConfig, tell: Callable[[str], None]
+    systems: Systems,
+    system: str,
+    suite: str,
+    items: Sequence[Item],
+    config: CompareConfig,
+    report: Callable[[str], None],
 ) -> Cell:
     if items[0].suite.story == PLANAR:
         return Cell(suite, system, reason="no pictures: lines only")
     tally, reason = _Tally(), None
     for item in items:
-        tell(f"{system}: {item.name}")
+        report(f"{system}: {item.name}")
         recording = open_recording(item.path(Path(config.recordings_dir)))
         try:
             _score(systems, system, item, recording, config.scores, tally)
         except (RecordingError, ValueError) as error:
-            # Of one recording of many, a failure would change what the others' mean is of.
+            # A failure on one of many recordings would leave a mean over fewer recordings than the other cells have.
             if tally.num or isinstance(error, ConfigError):
                 raise
             reason = str(error).removeprefix(f"{recording.name}: ")
             break
     if not tally.num:
         return Cell(suite, system, reason=reason)
-    ways = sorted({way for item in items if (way := systems.taken(system, item)) is not None})
-    told = tally.scores.result()
-    flat = [np.concatenate(parts) if parts else np.zeros(0) for parts in (tally.error_m, tally.still)]
-    error_m, still = (part[np.isfinite(part)] for part in flat)
+    labels = sorted({label for item in items if (label := systems.settings_label(system, item)) is not None})
+    scores = tally.scores.result()
+    arrays = [np.concatenate(parts) if parts else np.zeros(0) for parts in (tally.error_m, tally.false_alarms)]
+    error_m, false_alarms = (part[np.isfinite(part)] for part in arrays)
     return Cell(
         suite,
         system,
         tally.num,
-        int(told["num_frames"] or 0),
-        told.get("identification"),
-        told.get("iou"),
-        told.get("cle_px"),
+        int(scores["num_frames"] or 0),
+        scores.get("identification"),
+        scores.get("iou"),
+        scores.get("cle_px"),
         float(np.median(error_m)) * 1e3 if len(error_m) else None,
-        told.get("detected"),
-        float(np.mean(still)) if len(still) else None,
-        float(np.median(tally.pace_ms)),
-        settings=", ".join(ways) or None,
+        scores.get("detected"),
+        float(np.mean(false_alarms)) if len(false_alarms) else None,
+        float(np.median(tally.frame_ms)),
+        settings=", ".join(labels) or None,
     )
 
 
@@ -155,80 +161,86 @@ def _score(
 ) -> None:
     epcs = recording.resolve_epcs(None)
     elapsed_s: list[float] = []
-    claims: list[Claims] = []
-    traces = _watched(systems.traces(system, item, recording, epcs), elapsed_s, claims)
+    detections: list[Detections] = []
+    traces = _timed(systems.traces(system, item, recording, epcs), elapsed_s, detections)
     quiet = dataclasses.replace(settings, num_pictures=1)
     result = score_traces(traces, recording, epcs, stride=systems.stride(system, item), settings=quiet)
     tally.scores = tally.scores.merge(result.scores())
     tally.num += 1
-    # The first piece compiles and fills caches.
+    # The first piece includes compilation and fills caches.
     first = min(settings.frames_at_once, len(elapsed_s) // 2)
-    tally.pace_ms.append(1e3 * float(np.mean(elapsed_s[first:])))
-    _tally_places(result, epcs, claims, tally)
+    tally.frame_ms.append(1e3 * float(np.mean(elapsed_s[first:])))
+    _tally_positions(result, epcs, detections, tally)
 
 
-def _tally_places(result: RecordingResult, epcs: Sequence[str], claims: Sequence[Claims], tally: _Tally) -> None:
-    """Errors of the labelled tags' claimed places; claims of tags that lie still, most of which no label stands for."""
+def _tally_positions(
+    result: RecordingResult, epcs: Sequence[str], detections: Sequence[Detections], tally: _Tally
+) -> None:
+    """Position errors of the labelled tags, and detections of stationary tags, most of which are not labelled."""
     truth = result.recording.truth
-    place_m, found = (np.stack(parts) for parts in zip(*claims, strict=True))
+    position_m, detected = (np.stack(parts) for parts in zip(*detections, strict=True))
     for tag, epc in enumerate(epcs):
         if truth is None or epc not in truth.tag_position_m:
             continue
         true_m = np.asarray(truth.tag_position_m[epc], np.float64)
         known_m = true_m[np.isfinite(true_m).all(axis=-1)]
-        if len(known_m) and np.linalg.norm(known_m - np.median(known_m, axis=0), axis=-1).max() < _STILL_M:
-            tally.still.append(found[:, tag].astype(np.float64))
+        if len(known_m) and np.linalg.norm(known_m - np.median(known_m, axis=0), axis=-1).max() < _STATIONARY_M:
+            tally.false_alarms.append(detected[:, tag].astype(np.float64))
         frames = result.frames.get(epc)
         if frames is not None:
-            gap = np.linalg.norm(place_m[:, tag] - true_m, axis=-1)
-            tally.error_m.append(gap[frames.valid & frames.detected])
+            distance_m = np.linalg.norm(position_m[:, tag] - true_m, axis=-1)
+            tally.error_m.append(distance_m[frames.valid & frames.detected])
 
 
-def _watched(
-    traces: Iterator[tuple[int, Trace]], elapsed_s: list[float], claims: list[Claims]
+def _timed(
+    traces: Iterator[tuple[int, Trace]], elapsed_s: list[float], detections: list[Detections]
 ) -> Iterator[tuple[int, Trace]]:
-    """The same traces; notes how long each took to come, and what it claims."""
+    """The same traces; appends the computing time and the detections of each to the lists."""
     while True:
-        begun = time.perf_counter()
-        found = next(traces, None)
-        if found is None:
+        start_s = time.perf_counter()
+        item = next(traces, None)
+        if item is None:
             return
-        elapsed_s.append(time.perf_counter() - begun)
-        claims.append((np.asarray(found[1].centre_m, np.float64), np.asarray(found[1].detected, bool)))
-        yield found
+        elapsed_s.append(time.perf_counter() - start_s)
+        detections.append((np.asarray(item[1].centre_m, np.float64), np.asarray(item[1].detected, bool)))
+        yield item
 
 
 def console_table(cells: Iterable[Cell]) -> Table:
-    """The table for a terminal of 80 columns; why a method does not apply, the papers' figures, the legend stand below."""
+    """The table for a terminal of 80 columns, with the reasons of missing results, the papers' results and the legend below."""
     cells = list(cells)
     table = Table(box=SIMPLE, show_edge=False, padding=0)
     for name in ("suite", "system"):
         table.add_column(name, no_wrap=True)
-    for name in SHORT:
+    for name in SHORT_HEADINGS:
         table.add_column(name, no_wrap=True, justify="right")
     reasons: list[str] = []
     for cell in cells:
-        values = [said(getattr(cell, measure), measure) for measure in MEASURES]
+        values = [format_value(getattr(cell, measure), measure) for measure in MEASURES]
         if cell.reason is not None:
             if cell.reason not in reasons:
                 reasons.append(cell.reason)
             values = [f"({reasons.index(cell.reason) + 1})", *[""] * (len(MEASURES) - 1)]
         table.add_row(cell.suite, cell.system, *values)
-    ways: dict[tuple[str, str], list[str]] = {}
+    suites_by_settings: dict[tuple[str, str], list[str]] = {}
     for cell in cells:
         if cell.settings is not None:
-            ways.setdefault((cell.system, cell.settings), []).append(cell.suite)
+            suites_by_settings.setdefault((cell.system, cell.settings), []).append(cell.suite)
     below = [f"({number}) does not apply: {reason}" for number, reason in enumerate(reasons, 1)]
-    below += [f"{system} ({way}): {', '.join(suites)}" for (system, way), suites in ways.items()]
-    below += [f"{cell.system}'s own paper, {cell.suite}: {cell.paper}" for cell in cells if cell.paper is not None]
+    below += [
+        f"{system} ({settings}): {', '.join(suites)}" for (system, settings), suites in suites_by_settings.items()
+    ]
+    below += [
+        f"{cell.system}, result of its paper, {cell.suite}: {cell.paper}" for cell in cells if cell.paper is not None
+    ]
     table.caption = Text("\n".join([*below, *LEGEND]))
     table.caption_justify = "left"
     return table
 
 
 def _write(folder: Path, cells: list[Cell]) -> None:
-    (folder / "table.md").write_text(markdown(cells) + "\n", encoding="utf-8")
-    write_csv(folder / "table.csv", cells)
+    write_atomic(folder / "table.md", markdown(cells) + "\n")
+    write_cells(folder / "table.csv", cells)
     write_json(folder / "table.json", [dataclasses.asdict(cell) for cell in cells])
     bar_plot(
         folder / "comparison.png", {"identification": bars(cells, "identification"), "box IoU": bars(cells, "iou")}

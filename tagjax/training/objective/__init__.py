@@ -1,7 +1,8 @@
-"""Label-free objective: where the mask goes must explain what the tag's reads say, and nobody else's.
+"""Label-free objective: the motion of a tag's mask must explain the phases of this tag's reads, and of no other's.
 
-The soft mask's distance over time, linear between frames, is held against raw phases by their coherence or likelihood:
-nothing is unwrapped, and no label is used. Each term is a function of a `Seen` clip; `TERMS` names them, settings weigh them.
+The soft mask's distance over time, linear between frames, is compared with the raw phases by coherence or likelihood:
+phases are not unwrapped, and labels are not used. Each term is a function of `ObjectiveInputs`; `TERMS` lists the terms,
+`ObjectiveSettings` their weights.
 """
 
 from __future__ import annotations
@@ -11,16 +12,16 @@ from collections.abc import Callable, Mapping
 from jaxtyping import Array, Float
 
 from ...tracing.tracer import AbstractTracer, Camera, Frame
-from ._masks import area, compactness, coverage, future_agreement, steadiness
-from ._reads import Agreement, agreement, calibration, contrast, distance_at
-from ._seen import TERM_NAMES, ObjectiveSettings, Seen, clip_reads, see
+from .inputs import TERM_NAMES, ObjectiveInputs, ObjectiveSettings, clip_reads, objective_inputs
+from .masks import area, compactness, coverage, future_agreement, steadiness
+from .reads import Agreement, agreement, calibration, contrast, distance_at
 
 __all__ = [
     "TERMS",
     "TERM_NAMES",
     "Agreement",
+    "ObjectiveInputs",
     "ObjectiveSettings",
-    "Seen",
     "agreement",
     "area",
     "calibration",
@@ -31,11 +32,11 @@ __all__ = [
     "distance_at",
     "future_agreement",
     "objective",
-    "see",
+    "objective_inputs",
     "steadiness",
 ]
 
-Term = Callable[[Seen, ObjectiveSettings, Array], tuple[Float[Array, ""], dict[str, Array]]]
+Term = Callable[[ObjectiveInputs, ObjectiveSettings, Array], tuple[Float[Array, ""], dict[str, Array]]]
 
 TERMS: Mapping[str, Term] = {
     "contrast": contrast,
@@ -52,9 +53,9 @@ def objective(
     tracer: AbstractTracer, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
 ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
     """Every term that has a weight, unweighted, and diagnostics, of one clip."""
-    seen = see(tracer, camera, frames, settings)
+    inputs = objective_inputs(tracer, camera, frames, settings)
     terms, diagnostics = {}, {}
     for name in settings.weights():
-        terms[name], more = TERMS[name](seen, settings, key)
+        terms[name], more = TERMS[name](inputs, settings, key)
         diagnostics.update(more)
     return terms, diagnostics

@@ -1,4 +1,4 @@
-"""Accuracy of association scores against the length of the window that they see. Needs the viz extra."""
+"""Accuracy of association scores against window length, and speeds of real tags. Needs the viz extra."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..report.figure import blank
+from ...report.figure import blank
 
 if TYPE_CHECKING:
     from .real_tags import Association
 
 
 def accuracy_plot(path: Path, rows: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> None:
-    """A panel for each scene, a line for each method; `rows` are those of `evaluation.tracks.run_tracks`."""
+    """A panel for each scene, a line for each method; `rows` are those of `tagjax.evaluation.tracks.run_tracks`."""
     names = list(dict.fromkeys(row["scene"] for row in rows))
     figure = blank(4.2 * max(len(names), 1), 3.4)
     for axes, name in zip(np.atleast_1d(figure.subplots(1, max(len(names), 1), sharey=True)), names, strict=False):
@@ -36,19 +36,19 @@ def accuracy_plot(path: Path, rows: Sequence[Mapping[str, Any]], methods: Sequen
     figure.savefig(path, dpi=110)
 
 
-def speeds_plot(path: Path, found: Sequence[Association]) -> None:
-    """A panel for each recording: the tag's speed, to the scale of its carrier's, and the own tracks' towards the antenna."""
-    figure = blank(11.0, 2.4 * max(len(found), 1))
-    for axes, one in zip(np.atleast_1d(figure.subplots(max(len(found), 1), 1)), found, strict=False):
-        carrier = one.found[one.carrier]
-        for number, (walk, each) in enumerate(zip(one.tagged.walks, one.found, strict=False)):
+def speeds_plot(path: Path, associations: Sequence[Association]) -> None:
+    """A panel for each recording: the tag's speed, scaled to its carrier's, and the speeds of its own tracks towards the antenna."""
+    figure = blank(11.0, 2.4 * max(len(associations), 1))
+    for axes, one in zip(np.atleast_1d(figure.subplots(max(len(associations), 1), 1)), associations, strict=False):
+        carrier = one.alignments[one.carrier]
+        for number, (walk, each) in enumerate(zip(one.tagged.walks, one.alignments, strict=False)):
             label = f"track {walk.name[-4:]}, correlation {each.correlation:.2f}"
             style = "-" if number == one.carrier else ":"
             axes.plot(walk.time_s, walk.towards_m_s(each.antenna_m), style, label=label, linewidth=1.2)
-        heard = one.heard_m_s() / (carrier.slope or 1.0)
+        measured = one.measured_m_s() / (carrier.slope or 1.0)
         axes.plot(
             one.tagged.walks[one.carrier].time_s,
-            heard,
+            measured,
             "k.",
             markersize=2.5,
             label=f"tag, measured speed / {carrier.slope:.2f}",
@@ -57,6 +57,6 @@ def speeds_plot(path: Path, found: Sequence[Association]) -> None:
         axes.set_ylabel("towards antenna (m/s)", fontsize=8)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3)
-    if found:
+    if associations:
         figure.axes[-1].set_xlabel("time (s)")
     figure.savefig(path, dpi=110)

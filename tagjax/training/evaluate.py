@@ -1,0 +1,96 @@
+"""Evaluation of several tracers on the same recordings, with a report."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.progress import track
+
+from ..core.settings import ConfigError
+from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
+from ..recording import Recording
+from ..report.report import write_report
+from ..tracing.clips import Antennas, ClipSettings, clip_loader
+from ..tracing.tracer import AbstractTracer
+
+
+def parameters(tracer: AbstractTracer) -> dict[str, float]:
+    """The tracer's scalar parameters by name, in physical units where the tracer has a method `physical`."""
+    physical = getattr(tracer, "physical", None)
+    if physical is not None:
+        return dict(physical())
+    return {name: float(leaf) for name, leaf in vars(tracer).items() if isinstance(leaf, jax.Array) and leaf.ndim == 0}
+
+
+def smoothing_tracers(tracers: Mapping[str, AbstractTracer], settings: ScoreSettings) -> set[str]:
+    """Names of the tracers that are smoothed offline: with `settings.smooth` all that support it.
+
+    Raises `ConfigError` if `settings.smooth` is set and none supports it."""
+    names = {name for name, tracer in tracers.items() if settings.supported_by(tracer).smooth}
+    if settings.smooth and not names:
+        kinds = ", ".join(type(tracer).__name__ for tracer in tracers.values())
+        raise ConfigError(
+            f"scores.smooth is true, which {kinds} does not support; expected TagAttention. Set scores.smooth=false."
+        )
+    return names
+
+
+def antennas_for(tracer: AbstractTracer, antennas: Antennas) -> Antennas:
+    """The antennas that a tracer uses: only the one with the most reads (None) where it supports one and several are given."""
+    several = antennas == "all" or (antennas is not None and len(antennas) > 1)
+    return None if tracer.one_antenna and several else antennas
+
+
+def evaluate_tracers(
+    tracers: Mapping[str, AbstractTracer],
+    recordings: Sequence[Recording],
+    folder: Path,
+    *,
+    clips: ClipSettings,
+    estimators: Mapping[str, str] | None = None,
+    flows: Mapping[str, str] | None = None,
+    settings: ScoreSettings,
+    epcs: Sequence[str] | None = None,
+    frames: tuple[int, int] | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Run each tracer over each recording, write the report into `folder` and return its summary.
+
+    `estimators` and `flows` hold the radio estimator and the flow of tracers that do not use those of `clips`. A tracer that
+    supports one antenna uses the one with the most reads where `clips` has several. With `settings.smooth` the tracers
+    that support it are smoothed offline and get the suffix `_smoothed` in the report; the others run online. Raises
+    `ConfigError` where no tracer supports it.
+    """
+    estimators, flows = estimators or {}, flows or {}
+    loaders = {
+        name: clip_loader(
+            dataclasses.replace(
+                clips,
+                estimator=estimators.get(name, clips.estimator),
+                flow=flows.get(name, clips.flow),
+                antennas=antennas_for(tracer, clips.antennas),
+            )
+        )
+        for name, tracer in tracers.items()
+    }
+    smoothed = smoothing_tracers(tracers, settings)
+    labels = {name: f"{name}_smoothed" if name in smoothed else name for name in tracers}
+    work = [(name, number) for name in tracers for number in range(len(recordings))]
+    results: dict[str, list[RecordingResult]] = {labels[name]: [] for name in tracers}
+    for name, number in track(work, description="evaluate", disable=not progress):
+        results[labels[name]].append(
+            evaluate_recording(
+                tracers[name],
+                recordings[number],
+                loaders[name],
+                stride=clips.stride,
+                epcs=epcs,
+                settings=settings.supported_by(tracers[name]),
+                frames=frames,
+            )
+        )
+    return write_report(folder, results)
