@@ -150,7 +150,7 @@ def test_every_story_has_tracer_settings_in_the_comparison() -> None:
         suite = from_mapping(Suite, suites_named([path.stem])[path.stem])
         stories = {variant.story or suite.story for variant in suite.variants} - {PLANAR}
         assert stories <= set(systems.settings_of), path.stem
-    with pytest.raises(ConfigError, match="settings_of names magic"):
+    with pytest.raises(ConfigError, match="settings_of: found magic"):
         dataclasses.replace(systems, settings_of={"crowd": "magic"})
 
 
