@@ -657,7 +657,7 @@ def test_any_flow_by_name_comes_with_what_is_hidden(name: str) -> None:
 
 @pytest.mark.ci
 def test_networks_without_weights_and_variants_of_a_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"'raft_small' comes without weights.*flow=raft_small"):
+    with pytest.raises(ValueError, match=r"'raft_small' has no packaged weights.*flow=raft_small"):
         make_flow("raft_small")
     mine = tmp_path / "mine.safetensors"
     mine.write_bytes((tagjax.flow.weights.PACKAGED / "pyramid.safetensors").read_bytes())
@@ -678,8 +678,8 @@ def test_the_package_gives_flows_by_name() -> None:
 
 
 @pytest.mark.ci
-def test_readmes_flow_of_two_pictures_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[1] / "README.md").read_text().split("## Optical flow")[1]
+def test_documented_flow_of_two_pictures_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "flow.md").read_text()
     code = text.split("```python\n")[1].split("```")[0]
     for name, picture in zip(("a.png", "b.png"), _pictures(2, 70, 80), strict=True):
         cv2.imwrite(str(tmp_path / name), picture)

@@ -187,7 +187,7 @@ def folder(estimated, tmp_path):
 
 
 @pytest.mark.ci
-@pytest.mark.filterwarnings("ignore:The recording holds no tag read")
+@pytest.mark.filterwarnings("ignore:The recording has no tag read")
 def test_an_import_estimates_and_tells_so_that_it_can_be_repeated(folder, estimated) -> None:
     told, (_, depth), _, _ = estimated
     settings = ImportSettings(

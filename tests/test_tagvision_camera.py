@@ -238,7 +238,7 @@ def test_the_command_reports_the_result_or_the_error(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "new" / "camera.json").read_text())["intrinsics_reprojection_px"] < 0.15
     failed = subprocess.run([*run, given[2]], capture_output=True, text=True, cwd=ROOT)
     assert failed.returncode == 1
-    assert "give pictures=<folder" in failed.stderr
+    assert "expected pictures=<folder" in failed.stderr
 
 
 def test_folders_that_cannot_be_calibrated_are_refused(tmp_path: Path) -> None:

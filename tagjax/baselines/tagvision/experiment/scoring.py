@@ -189,7 +189,7 @@ def _distance_m(first: Float[np.ndarray, "points 3"], second: Float[np.ndarray, 
     return np.linalg.norm(first[..., :2] - second[..., :2], axis=-1)
 
 
-def _known_mm(error_m: Float[np.ndarray, " frames"]) -> Float[np.ndarray, " frames"]:
+def _known_mm(error_m: Float[np.ndarray, " frames"]) -> Float[np.ndarray, " known"]:
     return error_m[np.isfinite(error_m)] * 1e3
 
 
