@@ -58,8 +58,11 @@ def checked(schema: type[T], values: Mapping[str, Any], folder: Path) -> T:
 
 
 def write_config(values: Mapping[str, Any], folder: Path) -> None:
-    """Write config.yaml into the run folder."""
-    OmegaConf.save(OmegaConf.create(dict(values)), folder / "config.yaml")
+    """Write config.yaml into the run folder. The file appears whole or not at all."""
+    from tagjax.core.files import atomic_path
+
+    with atomic_path(folder / "config.yaml") as partial:
+        OmegaConf.save(OmegaConf.create(dict(values)), partial)
 
 
 def print_result(result: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from tagjax.core.files import atomic_path
+from .command import write_config
 
 _MAY_DIFFER = (
     "loop",
@@ -44,8 +44,7 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
                 f"{folder} holds a run with another configuration: {'; '.join(differences)}. Give the same settings to resume it "
                 "(retune=true allows another clip_norm and other numbers of the optimiser), or another folder."
             )
-    with atomic_path(path) as partial:
-        OmegaConf.save(OmegaConf.create(dict(values)), partial)
+    write_config(values, folder)
 
 
 def checkpoint_steps(folder: Path) -> list[int]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from .command import checked, command, print_result, write_config
+from .command import command, print_result, write_config
 from .suites import suites_named
 
 
@@ -23,12 +23,13 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from rich.progress import Progress
 
     from tagjax.baselines.tagview.experiment import TagviewExperiment, report_markdown, run_tagview, train_tagview
+    from tagjax.core.settings import from_mapping
 
     command_name, progress = values.pop("command"), values.pop("progress")
     if command_name not in ("run", "train"):
         raise ValueError(f"command is {command_name!r}; expected run or train.")
     suites_named(values["suites"])
-    config, console = checked(TagviewExperiment, values, folder), Console()
+    config, console = from_mapping(TagviewExperiment, values), Console()
     write_config({"command": command_name, **values}, folder)
     with Progress(console=console, disable=not progress) as bar:
         task = bar.add_task("tagview", total=None)

@@ -17,8 +17,8 @@ from tagjax.baselines.goller.matching import associate
 from tagjax.baselines.goller.offline import estimate, observe
 from tagjax.baselines.goller.room import find_room_frame
 from tagjax.baselines.goller.truth import true_states, true_tags
-from tagjax.baselines.reads import concatenate_reads
 from tagjax.recording import TagReads
+from tagjax.recording.reads import concatenate_reads
 
 
 @pytest.fixture(scope="module")

@@ -4,29 +4,11 @@ corrected.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from ..radio.channels import MAX_SLOPE_RAD_HZ, estimate_slope
 from ..recording import TagReads
-
-
-def concatenate_reads(parts: Sequence[TagReads]) -> TagReads:
-    """Reads of several parts in one, with the settings of the last; a column that one of them lacks is left out."""
-    if not parts:
-        return TagReads.empty()
-    last = parts[-1]
-    columns: dict[str, Any] = {}
-    for field in dataclasses.fields(last):
-        values = [getattr(part, field.name) for part in parts]
-        if isinstance(values[-1], np.ndarray):
-            complete = all(isinstance(value, np.ndarray) for value in values)
-            columns[field.name] = np.concatenate(values) if complete else None
-    return dataclasses.replace(last, **columns)
 
 
 def usable_reads(reads: TagReads, antenna: int) -> Bool[np.ndarray, " reads"]:

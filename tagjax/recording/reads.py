@@ -20,12 +20,24 @@ def join_reads(parts: Sequence[TagReads]) -> TagReads:
             raise RecordingError(
                 "The tables differ in phase period or sign; expected one convention. Convert them first."
             )
-    columns = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts])
-        for field in dataclasses.fields(first)
-        if all(isinstance(getattr(part, field.name), np.ndarray) for part in parts)
-    }
-    return dataclasses.replace(first, **columns)[np.argsort(columns["time_ns"], kind="stable")]
+    joined = dataclasses.replace(first, **_columns(parts))
+    return joined[np.argsort(joined.time_ns, kind="stable")]
+
+
+def concatenate_reads(parts: Sequence[TagReads]) -> TagReads:
+    """Consecutive reads of one reader in their order, with the settings of the last part; no read without any part."""
+    return dataclasses.replace(parts[-1], **_columns(parts)) if parts else TagReads.empty()
+
+
+def _columns(parts: Sequence[TagReads]) -> dict[str, np.ndarray | None]:
+    """The columns of all parts in one, by name; None for a column that one of the parts lacks."""
+    columns: dict[str, np.ndarray | None] = {}
+    for field in dataclasses.fields(TagReads):
+        values = [getattr(part, field.name) for part in parts]
+        arrays = [isinstance(value, np.ndarray) for value in values]
+        if any(arrays):
+            columns[field.name] = np.concatenate(values) if all(arrays) else None
+    return columns
 
 
 @dataclasses.dataclass(frozen=True)

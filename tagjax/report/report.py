@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 
-from ..core.results import write_json
+from ..core.results import write_csv, write_json
 from ..metrics.recordings import RecordingResult
 from ..metrics.tracking import Scores, label_box
 from .overlay import draw_overlay, short_name
@@ -53,25 +52,19 @@ def write_report(folder: Path, results: Results) -> dict[str, Any]:
 
 def write_frames(path: Path, results: Results) -> None:
     """One CSV row for each tracer, recording, tag and frame."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(("tracer", "recording", "epc", "label", "frame", "time_s", *_COLUMNS))
-        for tracer, ones in results.items():
-            for number, one in enumerate(ones):
-                for epc, frames in one.frames.items():
-                    offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
-                    for index, time_s in enumerate(frames.time_s):
-                        values = [getattr(frames, column)[index] for column in _COLUMNS]
-                        written = [int(v) if isinstance(v, np.bool_ | np.integer) else f"{v:.6g}" for v in values]
-                        head = (
-                            tracer,
-                            _recording_name(ones, number),
-                            epc,
-                            frames.label,
-                            offset + index,
-                            f"{time_s:.4f}",
-                        )
-                        rows.writerow((*head, *written))
+    write_csv(path, ("tracer", "recording", "epc", "label", "frame", "time_s", *_COLUMNS), _frame_rows(results))
+
+
+def _frame_rows(results: Results) -> Iterator[tuple[Any, ...]]:
+    for tracer, ones in results.items():
+        for number, one in enumerate(ones):
+            name = _recording_name(ones, number)
+            for epc, frames in one.frames.items():
+                offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
+                for index, time_s in enumerate(frames.time_s):
+                    values = [getattr(frames, column)[index] for column in _COLUMNS]
+                    written = [int(v) if isinstance(v, np.bool_ | np.integer) else f"{v:.6g}" for v in values]
+                    yield (tracer, name, epc, frames.label, offset + index, f"{time_s:.4f}", *written)
 
 
 def write_overlays(folder: Path, result: RecordingResult) -> None:

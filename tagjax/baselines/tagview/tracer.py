@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from ...recording import Intrinsics, Recording, TagReads
+from ...recording.reads import concatenate_reads
 from ...tracing.tracer import Trace
 from ..boxes import box_centre_px, box_mask
 from ..host_tracer import AbstractHostTracer, Detection, HostCamera, HostFrame, trace_from_detections
-from ..reads import concatenate_reads, padded_size, usable_reads
+from ..reads import padded_size, usable_reads
 from .detection import AbstractDetector, make_detector
 from .matching import Identification, MatchSettings, Traces, identify
 from .sequences import ReadSettings, tag_measurements

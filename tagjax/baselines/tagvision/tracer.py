@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ...recording import Recording, TagReads
+from ...recording.reads import concatenate_reads
 from ...tracing.tracer import Trace
 from ..host_tracer import AbstractHostTracer, Detection, HostCamera, HostFrame, trace_from_detections
 from ..opencv import grey
-from ..reads import concatenate_reads, usable_reads
+from ..reads import usable_reads
 from .detection import backward_flow, find_blobs
 from .matching import NO_MATCH, Match, match_tags
 from .plane import PlaneCamera
