@@ -246,6 +246,9 @@ def test_reads_of_unlike_conventions_are_not_joined() -> None:
     assert (both.time_ns[1:] >= both.time_ns[:-1]).all()
     with pytest.raises(RecordingError, match="Convert them first"):
         join_reads([one, dataclasses.replace(TagReads.empty(), phase_sign=-1)])
+    timed = dataclasses.replace(one, reader_time_ns=one.time_ns)
+    assert join_reads([timed, one]).reader_time_ns is None  # unknown for half of the reads
+    assert len(join_reads([timed, timed[:3]]).reader_time_ns) == one.num_reads + 3
 
 
 def test_a_tracer_of_one_antenna_gets_the_named_one_and_of_several_the_busiest() -> None:
