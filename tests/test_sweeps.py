@@ -245,7 +245,7 @@ SUITE = {
     "story": "handheld",
     "seed": 1,
     "duration_s": 3.0,
-    "settings": {"still_s": 0.4},
+    "settings": {"stationary_s": 0.4},
     "counts": {"train": 0, "validation": 0, "test": 1},
     "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
 }
