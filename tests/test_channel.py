@@ -13,7 +13,7 @@ from scipy.optimize import fminbound, minimize
 
 from tagjax.radio.noise import estimate_flip_probability
 from tagjax.radio.reader import HOP_TABLES_HZ, ReaderState
-from tagjax.recording.importers.clock import audit_clocks
+from tagjax.recording.importers.clock import to_host_clock
 from tagjax.recording.virtual_tags import Track
 from tagjax.sim.radio import channel
 from tagjax.sim.radio.channel import one_way_gain
@@ -509,7 +509,7 @@ def test_clock_offset_and_drift_are_recovered(offset_s, drift_ppm):
     """By the importer's audit; reads arrive 5 to 50 ms late. The second clock was never set."""
     settings = InventorySettings(clock_offset_s=offset_s, clock_drift_ppm=drift_ppm)
     origin_ns = 1_700_000_000_000_000_000
-    paths = still([[0.0, 0.0, 1.2], [0.3, 0.0, 1.2]])
+    paths = still([[0.0, 0.0, 1.2], [0.3, 0.0, 1.2]], duration_s=90.0)
     drawn = simulate_inventory(paths, AT_ORIGIN, free_space(), settings, seed=1, origin_ns=origin_ns)
     reads = drawn.reads
     reads.check()
@@ -517,9 +517,13 @@ def test_clock_offset_and_drift_are_recovered(offset_s, drift_ppm):
     assert stamps.min() > 0
     assert np.diff(stamps).min() > 0
     assert np.all(stamps % 1000 == 0)
-    audit = audit_clocks(stamps, reads.time_ns)
-    np.testing.assert_allclose(audit.drift_ppm, drift_ppm, atol=5)
-    np.testing.assert_allclose(audit.offset_s - offset_s, 0.005, atol=0.002)
+    audit = to_host_clock(stamps, reads.time_ns).audit
+    (piece,) = audit.pieces
+    np.testing.assert_allclose(piece.drift_ppm, drift_ppm, atol=5)
+    low, high = piece.drift_interval_ppm
+    assert low < drift_ppm < high
+    drifted_s = drift_ppm * 1e-6 * (piece.reference_ns - stamps[0]) * 1e-9
+    np.testing.assert_allclose(piece.offset_s - offset_s - drifted_s, 0.005, atol=0.002)
     assert audit.reader_epoch == ("unix" if offset_s < 1e6 else "1970")
     late = (reads.time_ns - origin_ns) * 1e-9 - drawn.time_s
     assert late.min() >= 0.005 - 1e-6

@@ -21,7 +21,6 @@ from experiments.suites import suites_named
 from tagjax.baselines.goller.experiment import GollerExperiment
 from tagjax.baselines.tagview.experiment import TagviewExperiment
 from tagjax.baselines.tagview.matching import MatchSettings
-from tagjax.core.build import build
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.compare import SystemSettings
 from tagjax.evaluation.flow import FlowEvaluationSettings
@@ -35,6 +34,8 @@ from tagjax.tagattention.tracer_settings import make_tracer, tracer_clips
 from tagjax.tracing.tracer import AbstractTracer
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_config import TrainFlowConfig
+from tagjax.training.flow_run import make_network
+from tagjax.training.optimizers import build_optimizer
 
 GROUPS = ("data", "tracer", "optimizer", "objective", "joint", "logger", "scores", "experiment", "debug")
 OPTUNA = any("optuna" in plugin.__module__ for plugin in Plugins.instance().discover(Sweeper))  # of the sweep extra
@@ -52,7 +53,7 @@ TRAINING = [option for group in GROUPS for option in _options(group) if option !
 def test_every_training_configuration_is_valid(override: str) -> None:
     config = settings(TrainConfig, "train", override)
     assert isinstance(make_tracer(config.tracer), AbstractTracer)
-    assert isinstance(build(config.optimizer), optax.GradientTransformation)
+    assert isinstance(build_optimizer(config.optimizer), optax.GradientTransformation)
     for baseline in config.baselines.values():
         assert isinstance(make_tracer(baseline), AbstractTracer)
     assert config.objective.weights()
@@ -80,11 +81,11 @@ def test_hand_held_objects_are_learned_on_every_second_pixel(experiment: str) ->
 )
 def test_every_flow_training_configuration_is_valid(overrides: list[str]) -> None:
     config = settings(TrainFlowConfig, "train_flow", *overrides)
-    made = jax.eval_shape(lambda: eqx.filter(build(config.flow), eqx.is_array))
+    made = jax.eval_shape(lambda: eqx.filter(make_network(config.flow), eqx.is_array))
     assert isinstance(made, AbstractFlowNetwork)
     for size in (config.data.variation.height, config.data.variation.width, config.data.variation.margin_px):
         assert size % made.divisor == 0
-    assert isinstance(build(config.optimizer), optax.GradientTransformation)
+    assert isinstance(build_optimizer(config.optimizer), optax.GradientTransformation)
 
 
 def test_every_recipe_is_tested() -> None:
@@ -96,7 +97,7 @@ def test_evaluation_configurations_are_valid() -> None:
     assert settings(EvaluateConfig, "evaluate").tracer is None
     chosen = settings(EvaluateConfig, "evaluate", "tracer=tagattention_paper", "frames=[0,20]", "scores=handheld")
     assert chosen.tracer is not None
-    assert isinstance(build(chosen.tracer), AbstractTracer)
+    assert isinstance(make_tracer(chosen.tracer), AbstractTracer)
     assert chosen.frames == (0, 20)
     assert chosen.scores["lock_frames"] == 10
 

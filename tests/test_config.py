@@ -20,12 +20,15 @@ from tagjax.evaluation.run import EvaluateConfig
 from tagjax.flow.losses import FlowLossSettings
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.recording.loading import VirtualTagSettings
+from tagjax.tagattention import TagAttention
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.tracing.clips import ClipSettings
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_sources import FlowDataSettings
 from tagjax.training.logging import LoggerSettings
 from tagjax.training.loop import LoopSettings
 from tagjax.training.objective import ObjectiveSettings
+from tagjax.training.optimizers import build_optimizer
 from tagjax.training.processes import DistributedSettings
 from tagjax.training.sources import DataSettings
 
@@ -90,34 +93,55 @@ def test_missing_keys_and_lengths() -> None:
 
 
 def test_build_makes_what_the_target_names() -> None:
-    assert isinstance(build({"_target_": "optax.adam", "learning_rate": 0.1}), optax.GradientTransformation)
+    adam = build_optimizer({"_target_": "optax.adam", "learning_rate": 0.1})
+    assert isinstance(adam, optax.GradientTransformation)
     nested = {"_target_": "optax.sgd", "learning_rate": {"_target_": "optax.constant_schedule", "value": 0.2}}
-    assert isinstance(build(nested), optax.GradientTransformation)
-    resting = build({"_target_": "tagjax.tracing.clips.ClipSettings", "stride": 2})
-    assert resting == ClipSettings(stride=2)
+    assert isinstance(build_optimizer(nested), optax.GradientTransformation)
+    assert isinstance(make_tracer({"_target_": "tagjax.tagattention.TagAttention"}), TagAttention)
+    assert build({"_target_": "clips", "stride": 2}, {"clips": ClipSettings}) == ClipSettings(stride=2)
 
 
 @pytest.mark.parametrize(
-    ("target", "message"),
+    "target",
     [
-        ("os.system", "starts with tagjax. or optax."),
-        ("tagjaxevil.thing", "starts with tagjax. or optax."),
-        ("tagjax.recording.dataclasses.asdict", "can be called"),
-        ("tagjax.training.logging.os.system", "can be called"),
-        ("tagjax.core.build._resolve", "can be called"),
-        ("optax.adamm", "can be called"),
-        ("tagjax.nothing.here", "can be called"),
-        (None, "found None"),
+        "os.system",
+        "tagjax.evaluation.timing.in_own_process",
+        "tagjax.tagattention.learned.save_parameters",
+        "tagjax.core.files.remove",
+        "tagjax.training.logging.os.system",
+        "tagjax.tagattention.TagAttention.__init__",
+        "optax.tree_utils.tree_map_params",
+        "optax.adam",
+        "TagAttention",
+        "",
+        None,
+        3,
+        ["tagjax.tagattention.TagAttention"],
     ],
 )
-def test_targets_that_are_refused(target: str | None, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        build({"_target_": target})
+def test_only_tracers_are_built_where_a_tracer_is_expected(target: Any) -> None:
+    with pytest.raises(
+        ConfigError, match=r"tracer: found _target_ .* expected one of tagjax\.tagattention\.TagAttention"
+    ):
+        make_tracer({"_target_": target})
+
+
+def test_nothing_is_called_before_all_names_are_checked() -> None:
+    called = []
+    slot = {"outer": lambda **given: called.append("outer"), "inner": lambda: called.append("inner")}
+    settings = {"_target_": "outer", "a": {"_target_": "inner"}, "b": {"_target_": "os.system"}}
+    with pytest.raises(ConfigError, match=r"x\.b: found _target_ 'os\.system'; expected one of inner"):
+        build(settings, {"outer": slot["outer"]}, where="x", inner={"inner": slot["inner"]})
+    with pytest.raises(ConfigError, match="expected plain values"):
+        build(settings, slot, where="x")
+    with pytest.raises(ConfigError, match=r"optimizer\.learning_rate: found _target_ 'optax\.adam'"):
+        build_optimizer({"_target_": "optax.adam", "learning_rate": {"_target_": "optax.adam", "learning_rate": 1.0}})
+    assert called == []
 
 
 def test_unknown_settings_of_a_target_are_refused() -> None:
     with pytest.raises(ConfigError, match="alhpa"):
-        build({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
+        make_tracer({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
 
 
 @pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention.paper.TagAttentionPaper"])
@@ -133,7 +157,7 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
 )
 def test_settings_that_no_tracer_can_have_are_named(tracer: str, settings: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        build({"_target_": f"tagjax.{tracer}", **settings}, where="tracer")
+        make_tracer({"_target_": f"tagjax.{tracer}", **settings})
 
 
 def _composed(command: str, *overrides: str) -> Any:

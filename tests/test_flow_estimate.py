@@ -27,7 +27,6 @@ import tagjax.flow
 import tagjax.flow.estimates
 import tagjax.flow.weights
 from tagjax.core.array_file import named_arrays
-from tagjax.core.build import build
 from tagjax.flow.cache import pair_flow
 from tagjax.flow.estimates import NetworkFlow, consistency, estimate, flow_along, forward_flow, padding
 from tagjax.flow.images import check_images, to_uint8
@@ -39,6 +38,7 @@ from tagjax.flow.stationary import zero_stationary
 from tagjax.flow.weights import load_network, load_weights, save_weights, weights_metadata
 from tagjax.recording.store import open_recording, save_recording
 from tagjax.tracing.clips import load_clip
+from tagjax.training.flow_run import make_network
 
 CONF = Path(__file__).parents[1] / "conf" / "flow"
 SETTINGS = {
@@ -83,7 +83,7 @@ def paint(flow_px: Any, height: int = 40, width: int = 56) -> np.ndarray:
 
 def small_network(seed: int = 0, gain: float = 1.0) -> PyramidFlow:
     """A small pyramid, its flow heads enlarged."""
-    network = build({**SETTINGS, "seed": seed})
+    network = make_network({**SETTINGS, "seed": seed})
     heads = lambda n: [decoder.head.weight for decoder in n.decoders]  # noqa: E731
     return eqx.tree_at(heads, network, [gain * weight for weight in heads(network)])
 
@@ -481,7 +481,7 @@ def test_packaged_weights_are_found_by_name_and_by_network(packaged):
     assert make_flow("pyramid") is flow
     fine = make_flow("pyramid_fine")
     assert isinstance(fine, NetworkFlow)
-    _same(fine.network, build({**SETTINGS, "seed": 5, "octaves": [-1, 0, 1, 2], "medians": 2}))
+    _same(fine.network, make_network({**SETTINGS, "seed": 5, "octaves": [-1, 0, 1, 2], "medians": 2}))
     assert make_flow("pyramid_fine") is fine
     assert flow_key("pyramid_fine") != flow_key("pyramid")
     assert make_flow("pyramid") is flow
@@ -491,14 +491,14 @@ def test_packaged_weights_are_found_by_name_and_by_network(packaged):
 
 def test_of_packaged_weights_of_one_class_those_that_fit_are_taken(packaged):
     apart = {**SETTINGS, "separable": True, "matched": [4, 4]}
-    split = build({**apart, "seed": 3})
+    split = make_network({**apart, "seed": 3})
     save_weights(packaged / "a.safetensors", split, {"flow": apart})
     save_weights(packaged / "b.safetensors", small_network(5), {"flow": SETTINGS})
     _same(load_weights(small_network()), small_network(5))
-    _same(load_weights(build(apart)), split)
+    _same(load_weights(make_network(apart)), split)
     _same(load_network("a"), split)
     with pytest.raises(ValueError, match="weights of a flow network that do not fit this network"):
-        load_weights(build({**SETTINGS, "widths": [8, 16]}))
+        load_weights(make_network({**SETTINGS, "widths": [8, 16]}))
 
 
 # Named flows
@@ -593,7 +593,7 @@ def test_flow_files_name_every_setting(name):
         assert eqx.tree_equal(built, eqx.filter_eval_shape(PyramidFlow))
         assert given == set(inspect.signature(PyramidFlow).parameters) - {"seed"}
     else:
-        built = build(settings)
+        built = make_network(settings)
         assert given == set(inspect.signature(type(built)).parameters)
         pictures = texture(48, 64), np.roll(texture(48, 64), 2, axis=1)
         np.testing.assert_array_equal(built(*pictures), make_flow(name)(*pictures))

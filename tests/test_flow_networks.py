@@ -19,7 +19,6 @@ from hydra import compose, initialize_config_dir
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
-from tagjax.core.build import build
 from tagjax.flow import flownet, raft
 from tagjax.flow._layers import Conv, SeparableConv, convex_upsample, enlarge, enlarge_flow, shrink, space_to_depth
 from tagjax.flow.cost_volume import cost_volume, normalise_features
@@ -28,6 +27,7 @@ from tagjax.flow.network import AbstractFlowNetwork, flow_both_ways
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.raft import RAFTSmall, halve, look_up, look_up_products
 from tagjax.image.median import median_filter
+from tagjax.training.flow_run import make_network
 
 CONF = Path(__file__).parents[1] / "conf" / "flow"
 
@@ -37,7 +37,7 @@ PUBLISHED: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "raft_small": RAFTSmall,
     "pyramid": PyramidFlow,
     "pyramid_fine": lambda: PyramidFlow(octaves=(-1, 0, 1, 2), medians=2),
-    "pyramid_fast": lambda: build(_settings("pyramid_fast")),
+    "pyramid_fast": lambda: make_network(_settings("pyramid_fast")),
 }
 TINY: dict[str, Callable[[], AbstractFlowNetwork]] = {
     "flownet_s": lambda: FlowNetS(width=1 / 64),
@@ -345,7 +345,9 @@ def test_the_configuration_names_every_setting(name):
     given = {key: value for key, value in settings.items() if key != "_target_"}
     defaults = {key: value.default for key, value in inspect.signature(PUBLISHED[name]).parameters.items()}
     assert given == defaults
-    assert _count(eqx.filter_eval_shape(lambda: build(settings))) == _count(eqx.filter_eval_shape(PUBLISHED[name]))
+    assert _count(eqx.filter_eval_shape(lambda: make_network(settings))) == _count(
+        eqx.filter_eval_shape(PUBLISHED[name])
+    )
 
 
 @pytest.mark.ci

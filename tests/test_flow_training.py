@@ -767,7 +767,7 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
         configured(tmp_path, data={"drawn": {"num_validation": 0}})
     with pytest.raises(ConfigError, match="expected one of 'bfloat16'"):
         configured(tmp_path, matmul_precision="bf16")
-    with pytest.raises(ValueError, match="is not a network that can be trained"):
+    with pytest.raises(ValueError, match=r"flow: found _target_ .*DISFlow.*expected one of tagjax\.flow"):
         run_flow_training(configured(tmp_path, flow={"_target_": "tagjax.flow.opencv.DISFlow"}), tmp_path / "run")
 
 

@@ -21,12 +21,14 @@ import zarr
 from tagjax.flow import cache as flow_cache
 from tagjax.flow.cache import pair_flow
 from tagjax.flow.registry import make_flow
-from tagjax.recording import ClockAudit, Recording, RecordingError, RecordingWarning, TagReads, Truth, store
+from tagjax.recording import ClockAudit, ClockPiece, Recording, RecordingError, RecordingWarning, TagReads, Truth, store
 from tagjax.recording.store import open_recording, save_recording, write_recording
 from tagjax.recording.stored_frames import StoredFrames
 from tagjax.recording.time_reversal import time_reversed
 from tagjax.tracing.clips import load_clip
 from tagjax.training.clip_dataset import clip_dataset
+
+CLOCK = ClockAudit((ClockPiece(10**18, 400, 1.5, (1.4, 1.6), 20.0, (18.0, 22.0)),), 0.3, 400, 2, "unix")
 
 
 def _with_reads(recording: Recording, **columns) -> Recording:
@@ -39,8 +41,7 @@ def recording() -> Recording:
 
 
 def test_round_trip(recording, tmp_path):
-    audit = ClockAudit(1.5, 20.0, 0.3, 400, "unix")
-    save_recording(dataclasses.replace(recording, clock=audit), tmp_path / "a.zarr")
+    save_recording(dataclasses.replace(recording, clock=CLOCK), tmp_path / "a.zarr")
     again = open_recording(tmp_path / "a.zarr")
     for t in (0, 11):
         np.testing.assert_array_equal(again.colour[t], recording.colour[t])
@@ -49,7 +50,7 @@ def test_round_trip(recording, tmp_path):
     for field in dataclasses.fields(TagReads):
         np.testing.assert_array_equal(getattr(again.reads, field.name), getattr(recording.reads, field.name))
     assert again.intrinsics == recording.intrinsics
-    assert again.clock == audit
+    assert again.clock == CLOCK
     assert again.truth.tag_to_label == dict(recording.truth.tag_to_label)
     np.testing.assert_array_equal(again.truth.tag_range_m["tag-a"], recording.truth.tag_range_m["tag-a"])
     assert isinstance(again.colour, StoredFrames)
@@ -194,9 +195,7 @@ def test_numpy_values_in_attributes_are_made_plain(recording, tmp_path):
             width=np.int64(32),
             distortion=(np.float32(0.5), np.float64(0), 0.0, np.float32(0)),
         ),
-        clock=_unchecked(
-            ClockAudit(0.0, 2.0, float("nan"), 7, "unix"), offset_s=np.float32(1.5), num_reads=np.int64(7)
-        ),
+        clock=_unchecked(CLOCK, residual_ms=np.float32("nan"), num_reads=np.int64(7)),
         name=np.str_("odd"),
         reads=_unchecked(
             recording.reads, hop_table_hz=np.array([9e8, 9.1e8]), pi_flips=np.bool_(True), phase_sign=np.int8(1)
@@ -225,7 +224,7 @@ def test_numpy_values_in_attributes_are_made_plain(recording, tmp_path):
         ("truth", {"tag_to_label": {"tag-a": {1, 2}}}, r"truth\['tag_to_label'\]\['tag-a'\] holds \{1, 2\} \(set\)"),
         ("truth", {"tag_to_label": {3: 1}}, "the key 3; expected strings"),
         ("truth", {"visible": {1: np.array(["yes"])}}, "truth/visible/0 holds <U3"),
-        ("clock", {"offset_s": 1j}, r"clock\['offset_s'\] holds 1j"),
+        ("clock", {"residual_ms": 1j}, r"clock\['residual_ms'\] holds 1j"),
         ("reads", {"antenna": np.array([None])}, "reads/antenna holds object"),
         (None, {"source": Path("somewhere")}, "source holds PosixPath"),
     ],
@@ -237,7 +236,7 @@ def test_what_cannot_be_stored_is_refused_before_any_frame_is_written(recording,
         def __getitem__(self, index):
             raise AssertionError("a frame was written")
 
-    recording = dataclasses.replace(recording, colour=Unread(), clock=ClockAudit(0.0, 0.0, 0.0, 1, "unix"))
+    recording = dataclasses.replace(recording, colour=Unread(), clock=CLOCK)
     changed = change if part is None else {part: _unchecked(getattr(recording, part), **change)}
     with pytest.raises(RecordingError, match=message):
         save_recording(_unchecked(recording, **changed), tmp_path / "a.zarr")

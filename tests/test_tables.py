@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tagjax.recording import RecordingError, RecordingWarning
-from tagjax.recording.importers.clock import audit_clocks, reader_epoch, to_host_ns
+from tagjax.recording.importers.clock import reader_epoch, to_host_clock
 from tagjax.recording.importers.formats import FORMATS, clean_epc, recognise, stamp_ns
 from tagjax.recording.importers.tables import import_table
 
@@ -163,13 +163,16 @@ def test_clock_audit_recovers_offset_and_drift_through_latency():
     since = (reader - reader[0]) * 1e-9
     latency = 0.004 + rng.exponential(0.02, 4000)
     host = reader + np.rint((0.4 + 40e-6 * since + latency) * 1e9).astype(np.int64)
-    audit = audit_clocks(reader, host)
-    assert abs(audit.drift_ppm - 40) < 5
-    assert abs(audit.offset_s - 0.404) < 0.002
-    moved = to_host_ns(reader, audit)
-    np.testing.assert_allclose((moved - reader) * 1e-9 - 40e-6 * since, 0.404, atol=0.002)
+    found = to_host_clock(reader, host)
+    (piece,) = found.audit.pieces
+    assert abs(piece.drift_ppm - 40) < 5
+    low, high = piece.drift_interval_ppm
+    assert low < 40 < high
+    assert abs(piece.offset_s - (0.404 + 40e-6 * (piece.reference_ns - reader[0]) * 1e-9)) < 0.002
+    assert found.usable.all()
+    np.testing.assert_allclose((found.time_ns - reader) * 1e-9 - 40e-6 * since, 0.404, atol=0.002)
     with pytest.raises(RecordingError, match="two of each"):
-        audit_clocks(reader[:1], host[:1])
+        to_host_clock(reader[:1], host[:1])
 
 
 def test_stamps_and_epcs():
@@ -210,5 +213,8 @@ def test_real_tables(real_data, path, name, rate):
     assert rate[0] < reads.num_reads / ((reads.time_ns[-1] - reads.time_ns[0]) * 1e-9) < rate[1]
     if name == "tagbeat":
         assert audit is not None
-        assert abs(audit.drift_ppm) < 100
+        assert len(audit.pieces) == 1
+        assert audit.num_set_aside == 0
+        low, high = audit.pieces[0].drift_interval_ppm
+        assert 20 < low < high < 40
         assert audit.residual_ms < 3

@@ -1,58 +1,42 @@
-"""Objects from settings that name their class or function by `_target_`, which reach no further than tagjax and Optax."""
+"""Objects from settings that name a class by `_target_`. Each place of the settings has a list of the classes it takes."""
 
 from __future__ import annotations
 
-import functools
-import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from .settings import ConfigError
 
-TARGET_PREFIXES = ("tagjax.", "optax.")
+Slot = Mapping[str, Callable[..., Any]]
+"""What `_target_` may name in one place of the settings: the class or function of each name. Nothing else is called."""
 
 
-def build(settings: Mapping[str, Any], *, where: str = "_target_") -> Any:
-    """Call what `_target_` names with the other keys as arguments; nested mappings with a `_target_` are built first.
+def build(settings: Mapping[str, Any], slot: Slot, *, where: str = "_target_", inner: Slot | None = None) -> Any:
+    """Call what `_target_` names with the other keys as arguments.
 
-    Raises `ConfigError` for a target outside of tagjax and Optax, one that does not exist, or arguments that it does not
-    take.
+    `_target_` is looked up in `slot`, and that of a nested mapping, which is built first, in `inner`; no module is
+    imported by name. All names are checked before anything is called. Raises `ConfigError` for a name that is not in the
+    slot, or arguments that its class does not take.
     """
-    target = settings.get("_target_")
-    if not isinstance(target, str) or not target.startswith(TARGET_PREFIXES):
-        raise ConfigError(
-            f"{where}: found {target!r}; expected a name that starts with {' or '.join(TARGET_PREFIXES)}."
-        )
-    arguments = {
-        str(key): build(value, where=f"{where}.{key}") if isinstance(value, Mapping) and "_target_" in value else value
-        for key, value in settings.items()
-        if key != "_target_"
-    }
-    called = _resolve(target, where)
+    called = find_target(settings, slot, where=where)
+    parts = {str(key): value for key, value in settings.items() if key != "_target_"}
+    nested = {key: value for key, value in parts.items() if isinstance(value, Mapping) and "_target_" in value}
+    for key, value in nested.items():
+        find_target(value, inner or {}, where=f"{where}.{key}")
+    for key, value in nested.items():
+        parts[key] = build(value, inner or {}, where=f"{where}.{key}")
     try:
-        return called(**arguments)
+        return called(**parts)
     except TypeError as error:
-        raise ConfigError(f"{where}: {target} does not take these settings: {error}.") from error
-    except ValueError as error:
+        raise ConfigError(f"{where}: {settings['_target_']} does not take these settings: {error}.") from error
+    except (ValueError, OverflowError) as error:
         raise ConfigError(f"{where}: {error}") from error
 
 
-def _resolve(target: str, where: str) -> Any:
-    parts = target.split(".")
-    for cut in range(len(parts) - 1, 0, -1):
-        try:
-            module = importlib.import_module(".".join(parts[:cut]))
-        except ModuleNotFoundError:
-            continue
-        if any(part.startswith("_") for part in parts[cut:]):
-            break
-        try:
-            found = functools.reduce(getattr, parts[cut:], module)
-        except AttributeError:
-            break
-        # A module's imports are not its own: they must not be a way around the prefixes.
-        owner = getattr(found, "__module__", None) or ""
-        if callable(found) and (owner + ".").startswith(TARGET_PREFIXES):
-            return found
-        break
-    raise ConfigError(f"{where}: found {target!r}, which is nothing that can be called; check the spelling.")
+def find_target(settings: Mapping[str, Any], slot: Slot, *, where: str) -> Callable[..., Any]:
+    """The class of the slot that `_target_` names. Raises `ConfigError` for any other name."""
+    target = settings.get("_target_")
+    if not isinstance(target, str) or target not in slot:
+        expected = f"one of {', '.join(slot)}" if slot else "plain values without `_target_`"
+        raise ConfigError(f"{where}: found _target_ {target!r}; expected {expected}.")
+    return slot[target]

@@ -5,9 +5,6 @@ Nothing in a file is executed. The only class that its settings can name is a fl
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +14,7 @@ import jax
 
 from ..core.array_file import ArrayFile, named_arrays
 from .network import AbstractFlowNetwork
+from .networks import NETWORKS
 
 PACKAGED = Path(__file__).parent / "weights"
 """The folder of the weights that come with the package: <name>.safetensors."""
@@ -24,7 +22,6 @@ PACKAGED = Path(__file__).parent / "weights"
 SUFFIX = ".safetensors"
 
 _FILE = ArrayFile("tagjax-flow-weights", 1, "weights of a flow network", "python -m experiments.train_flow")
-_TARGET = re.compile(r"tagjax\.flow\.([a-z][a-z0-9_]*)\.([A-Z]\w*)")
 
 Network = TypeVar("Network", bound=AbstractFlowNetwork)
 
@@ -116,12 +113,11 @@ def _shapes(network: Any) -> dict[str, tuple[int, ...]]:
 def _abstract_network(settings: Mapping[str, Any], where: str) -> AbstractFlowNetwork:
     """The network that settings build, with shapes in place of arrays, so that no memory of its size is allocated."""
     target = settings.get("_target_")
-    match = _TARGET.fullmatch(target) if isinstance(target, str) else None
-    network = None
-    if match is not None and (Path(__file__).parent / f"{match[1]}.py").is_file():
-        network = getattr(importlib.import_module(f"tagjax.flow.{match[1]}"), match[2], None)
-    if not inspect.isclass(network) or not issubclass(network, AbstractFlowNetwork) or inspect.isabstract(network):
-        raise ValueError(f"{where}: the settings name {target!r}; expected a network of tagjax.flow.")
+    network = NETWORKS.get(target) if isinstance(target, str) else None
+    if network is None:
+        raise ValueError(
+            f"{where}: the settings name {target!r}; expected a network of tagjax.flow ({', '.join(NETWORKS)})."
+        )
     arguments = {str(key): value for key, value in settings.items() if key != "_target_"}
     try:
         return eqx.filter_eval_shape(lambda: network(**arguments))

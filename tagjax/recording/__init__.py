@@ -5,5 +5,6 @@ from ..core.errors import RecordingError as RecordingError
 from ..core.errors import RecordingWarning as RecordingWarning
 from .reads import TagReads as TagReads
 from .recording import ClockAudit as ClockAudit
+from .recording import ClockPiece as ClockPiece
 from .recording import Recording as Recording
 from .recording import Truth as Truth

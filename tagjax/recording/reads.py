@@ -56,7 +56,8 @@ class TagReads:
     phase_rad: np.ndarray  # (num_reads,) float64
     rssi_dbm: np.ndarray  # (num_reads,) float32
     doppler_hz: np.ndarray  # (num_reads,) float32
-    reader_time_ns: np.ndarray | None = None  # (num_reads,) int64, reader clock
+    reader_time_ns: np.ndarray | None = None  # (num_reads,) int64, reader clock, as reported
+    arrival_time_ns: np.ndarray | None = None  # (num_reads,) int64, host clock, as recorded
     channel_index: np.ndarray | None = None  # (num_reads,) int16, counted from 1 into hop_table_hz
     hop_table_hz: tuple[float, ...] = ()
     phase_period_rad: float = 2 * np.pi

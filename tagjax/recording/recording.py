@@ -45,13 +45,25 @@ class Truth:
 
 
 @dataclasses.dataclass(frozen=True)
-class ClockAudit:
-    """How the reader's clock relates to the host's: host = reader + offset + drift * (reader - first reader time)."""
+class ClockPiece:
+    """A piece of a table without a jump of a clock: host = reader + offset + drift * (reader - reference)."""
 
-    offset_s: float
-    drift_ppm: float
-    residual_ms: float
+    reference_ns: int  # reader's clock
     num_reads: int
+    offset_s: float
+    offset_interval_s: tuple[float, float]  # 95 %; a single value where the piece has few reads
+    drift_ppm: float  # 0 where the piece is too short to measure it
+    drift_interval_ppm: tuple[float, float] | None  # 95 %; None where it was not measured
+
+
+@dataclasses.dataclass(frozen=True)
+class ClockAudit:
+    """How the reader's clock relates to the host's, piece by piece in order of arrival."""
+
+    pieces: tuple[ClockPiece, ...]
+    residual_ms: float  # spread of the smallest delays of arrival, of the piece where it is largest
+    num_reads: int
+    num_set_aside: int  # reads whose reader time fits no piece
     reader_epoch: str  # "unix", or "1970" or "2000" for a reader clock that was never set
     note: str = ""
 

@@ -18,7 +18,7 @@ from ..core.errors import RecordingError
 from ..core.files import atomic_path
 from ..core.types import LazyArray
 from .reads import TagReads
-from .recording import ClockAudit, Recording, Truth
+from .recording import ClockAudit, ClockPiece, Recording, Truth
 from .stored_frames import StoredFrames, create_array
 
 FORMAT = "tagjax-recording"
@@ -228,8 +228,32 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         antennas_m=array("antennas_m")[...],
         depth_kind=attributes["depth_kind"],
         truth=truth,
-        clock=None if attributes["clock"] is None else ClockAudit(**attributes["clock"]),
+        clock=None if attributes["clock"] is None else _clock(attributes["clock"], reads),
         name=attributes["name"],
         source=attributes["source"],
         store=root if writable else None,
     )
+
+
+def _clock(stored: dict[str, Any], reads: TagReads) -> ClockAudit:
+    if "pieces" not in stored:  # an older recording: one line for the whole table, without intervals
+        reader_ns = reads.reader_time_ns
+        piece = {
+            "reference_ns": 0 if reader_ns is None or not len(reader_ns) else int(reader_ns.min()),
+            "num_reads": stored["num_reads"],
+            "offset_s": stored["offset_s"],
+            "offset_interval_s": [stored["offset_s"]] * 2,
+            "drift_ppm": stored["drift_ppm"],
+            "drift_interval_ppm": None,
+        }
+        stored = {name: value for name, value in stored.items() if name not in ("offset_s", "drift_ppm")}
+        stored |= {"pieces": [piece], "num_set_aside": 0}
+    pieces = []
+    for piece in stored["pieces"]:
+        drift = piece["drift_interval_ppm"]
+        intervals = {
+            "offset_interval_s": tuple(piece["offset_interval_s"]),
+            "drift_interval_ppm": drift and tuple(drift),
+        }
+        pieces.append(ClockPiece(**{**piece, **intervals}))
+    return ClockAudit(**{**stored, "pieces": tuple(pieces)})

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..recording import ClockAudit, Intrinsics, Recording, TagReads, Truth
-from ..recording.importers.clock import audit_clocks, to_host_ns
+from ..recording.importers.clock import to_host_clock
 from ..recording.virtual_tags import Track
 from .radio.environment import room_environment
 from .radio.inventory import simulate_inventory
@@ -226,8 +226,9 @@ def _read_tags(scenario: Scenario, seed: int) -> tuple[TagReads, ClockAudit | No
     if reads.reader_time_ns is None or reads.num_reads < 2:
         return reads, None, sight
     # As importers do: times of the reader's clock, converted to the host's clock.
-    audit = audit_clocks(reads.reader_time_ns, reads.time_ns)
-    return dataclasses.replace(reads, time_ns=to_host_ns(reads.reader_time_ns, audit)), audit, sight
+    converted = to_host_clock(reads.reader_time_ns, reads.time_ns)
+    reads = dataclasses.replace(reads, time_ns=converted.time_ns, arrival_time_ns=reads.time_ns)
+    return reads[converted.usable], converted.audit, sight
 
 
 def _people(world: World) -> list[np.ndarray]:

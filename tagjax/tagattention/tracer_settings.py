@@ -15,17 +15,22 @@ from ..tracing.clips import ClipSettings
 from ..tracing.tracer import AbstractTracer
 from . import TagAttention
 from .learned import load_parameters, read_learned
+from .paper import TagAttentionPaper
+
+TRACERS: dict[str, type[AbstractTracer]] = {
+    "tagjax.tagattention.TagAttention": TagAttention,
+    "tagjax.tagattention.paper.TagAttentionPaper": TagAttentionPaper,
+}
+"""The tracers that settings can name as `_target_`."""
 
 
 def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> AbstractTracer:
     """The tracer that the settings describe, with the learned parameters `weights` if given (`load_parameters`).
 
-    Raises `ValueError` if the settings describe something else, or a tracer that has no learned parameters.
+    Raises `ConfigError` if the settings describe something else, `ValueError` for weights of a tracer that has none.
     """
     parameters = {name: value for name, value in settings.items() if name != "clips"}
-    tracer = build(parameters, where="tracer")
-    if not isinstance(tracer, AbstractTracer):
-        raise ValueError(f"tracer: found {settings['_target_']}; expected a subclass of AbstractTracer.")
+    tracer = build(parameters, TRACERS, where="tracer")
     if weights is None:
         return tracer
     if not isinstance(tracer, TagAttention):

@@ -23,6 +23,7 @@ from ..flow.estimates import NetworkFlow, forward_flow
 from ..flow.image_sequences import open_sequence
 from ..flow.losses import FlowLossSettings
 from ..flow.network import AbstractFlowNetwork
+from ..flow.networks import NETWORKS
 from ..flow.registry import make_flow
 from ..flow.weights import load_weights, save_weights
 from ..metrics.flow import FlowScores
@@ -34,6 +35,7 @@ from .flow_sources import flow_dataset, installed_photographs, validation_pairs
 from .flow_step import FlowTrainState, flow_step
 from .logging import Logger
 from .loop import resume_state, train
+from .optimizers import build_optimizer
 from .processes import distributed_runtime, is_first
 from .step import make_optimizer
 
@@ -44,13 +46,8 @@ _WARPED_PAIRS = 8
 
 
 def make_network(settings: Mapping[str, Any]) -> AbstractFlowNetwork:
-    """The flow network of the settings. Raises `ValueError` if `_target_` is not a flow network."""
-    network = build(settings, where="flow")
-    if not isinstance(network, AbstractFlowNetwork):
-        raise ValueError(
-            f"flow: {settings['_target_']} is not a network that can be trained; choose one, for example flow=pyramid."
-        )
-    return network
+    """The flow network of the settings. Raises `ConfigError` if `_target_` is not one of `NETWORKS`."""
+    return build(settings, NETWORKS, where="flow")
 
 
 def initial_network(settings: Mapping[str, Any], weights: str | None) -> AbstractFlowNetwork:
@@ -75,7 +72,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     network = initial_network(config.flow, config.weights)
     _check_sizes(network, config.data.variation, config.loss)
     check_batch(config.loop.batch_size)
-    optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
+    optimizer = make_optimizer(build_optimizer(config.optimizer), config.clip_norm)
     state = FlowTrainState.create(network, optimizer, seed=config.seed)
     shard = jax.process_index(), jax.process_count()
     samples = iter(flow_dataset(config.data, seed=config.seed, progress=config.loop.progress, shard=shard))

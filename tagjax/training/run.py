@@ -12,7 +12,6 @@ import numpy as np
 import optax
 from rich.console import Console
 
-from ..core.build import build
 from ..core.results import to_json_values, write_json
 from ..recording import Recording
 from ..report.report import score_table
@@ -29,6 +28,7 @@ from .flow_run import initial_network
 from .joint import JointModel, save_network
 from .logging import Logger
 from .loop import TrainingResult, resume_state, train
+from .optimizers import build_optimizer
 from .processes import distributed_runtime, is_first, local_batch_size
 from .sources import training_recordings
 from .state import TrainState
@@ -48,10 +48,10 @@ def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
 
 def initial_state(config: TrainConfig) -> tuple[TrainState, optax.GradientTransformation]:
     """The state before the first step, and the optimiser."""
-    optimizer = make_optimizer(build(config.optimizer, where="optimizer"), config.clip_norm)
+    optimizer = make_optimizer(build_optimizer(config.optimizer), config.clip_norm)
     if config.joint is not None:
         network_optimizer = make_optimizer(
-            build(config.joint.optimizer, where="joint.optimizer"), config.joint.clip_norm
+            build_optimizer(config.joint.optimizer, where="joint.optimizer"), config.joint.clip_norm
         )
         optimizer = make_joint_optimizer(optimizer, network_optimizer)
     return TrainState.create(make_model(config), optimizer, seed=config.seed), optimizer

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from ...core.errors import RecordingError, RecordingWarning
 from ..reads import TagReads
 from ..recording import ClockAudit
-from .clock import audit_clocks, reader_epoch, to_host_ns
+from .clock import HostTimes, reader_epoch, to_host_clock
 from .formats import FORMATS, Format, Read, RowError, recognise
 
 MAX_REJECTED = 0.5
@@ -58,7 +59,8 @@ def import_table(
         hop_table_hz: carriers of channel index 1, 2, ... (readers number their own, shuffled hop table).
         carrier_hz: the one carrier of a reader that does not hop.
         clock: "reader" uses the reader's clock as it is, "arrival" the host's; a number of seconds is added to the
-            reader's; "auto" converts reader times to the host's clock by an audit if the table has both.
+            reader's; "auto" converts reader times to the host's clock (`to_host_clock`) if the table has both. Rows whose
+            reader time fits no clock are then rejected.
         synthetic_rate_hz: rows of a table without times get times in order, each tag at this rate.
 
     Raises `RecordingError` if no format fits, phases are absent, or more than half of the rows are rejected.
@@ -91,20 +93,24 @@ def import_table(
             "units; set format= to one of " + ", ".join(FORMATS) + "."
         )
     notes: list[str] = []
-    host_ns, reader_ns, audit = _times(reads, clock, synthetic_rate_hz, notes)
+    times = _times(reads, clock, synthetic_rate_hz, notes)
     carrier, index = _carriers(reads, hop_table_hz, carrier_hz, notes)
     table = TagReads(
         epc=np.array([read.epc for read in reads]),
-        time_ns=host_ns,
+        time_ns=times.time_ns,
         antenna=np.array([read.antenna for read in reads], np.int16),
         carrier_hz=carrier,
         phase_rad=np.array([read.phase_rad for read in reads], np.float64),
         rssi_dbm=np.array([np.nan if read.rssi_dbm is None else read.rssi_dbm for read in reads], np.float32),
         doppler_hz=np.array([np.nan if read.doppler_hz is None else read.doppler_hz for read in reads], np.float32),
-        reader_time_ns=reader_ns,
+        reader_time_ns=times.reader_ns,
+        arrival_time_ns=times.arrival_ns,
         channel_index=index,
         hop_table_hz=tuple(hop_table_hz or ()),
     )
+    if not times.usable.all():
+        rejected["the reader's time fits no clock"] = int(np.sum(~times.usable))
+        table = table[times.usable]
     order = np.argsort(table.time_ns, kind="stable")
     back = int(np.sum(np.diff(table.time_ns) < 0))
     if back:
@@ -122,7 +128,7 @@ def import_table(
     if repeated.any():
         rejected["repeats the read before it"] = int(repeated.sum())
         table = table[~repeated]
-    return table, audit, ImportReport(chosen.name, num_rows, table.num_reads, dict(rejected), tuple(notes))
+    return table, times.audit, ImportReport(chosen.name, num_rows, table.num_reads, dict(rejected), tuple(notes))
 
 
 def _choose(path: Path, lines: list[str], name: str) -> Format:
@@ -155,15 +161,25 @@ def _checked(read: Read) -> Read:
     return read
 
 
-def _times(
-    reads: list[Read], clock: str | float, rate_hz: float, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray | None, ClockAudit | None]:
+@dataclasses.dataclass(frozen=True)
+class _Times:
+    """Times of a table's rows: those to use, and the raw ones."""
+
+    time_ns: np.ndarray  # (num_rows,) int64
+    usable: np.ndarray  # (num_rows,) bool
+    reader_ns: np.ndarray | None
+    arrival_ns: np.ndarray | None
+    audit: ClockAudit | None
+
+
+def _times(reads: list[Read], clock: str | float, rate_hz: float, notes: list[str]) -> _Times:
     def column(name: str) -> np.ndarray | None:
         values = [getattr(read, name) for read in reads]
         return None if any(value is None for value in values) else np.array(values, np.int64)
 
-    reader, host = column("reader_ns"), column("host_ns")
-    if reader is None and host is None:
+    reader, arrival = column("reader_ns"), column("host_ns")
+    all_rows = np.ones(len(reads), bool)
+    if reader is None and arrival is None:
         counts: collections.Counter[str] = collections.Counter()
         stamps = []
         for read in reads:
@@ -175,27 +191,67 @@ def _times(
             stacklevel=4,
         )
         notes.append(f"no times in the table: set in order at {rate_hz:g} reads/s per tag")
-        return np.array(stamps, np.int64), None, None
-    audit = audit_clocks(reader, host) if reader is not None and host is not None and len(reads) > 1 else None
+        return _Times(np.array(stamps, np.int64), all_rows, None, None, None)
     if reader is not None and reader_epoch(reader) != "unix":
         note = f"the reader's clock was never set: it started in {reader_epoch(reader)}"
         warnings.warn(note[0].upper() + note[1:] + ".", RecordingWarning, stacklevel=4)
         notes.append(note)
+    compared = _compare_clocks(reader, arrival, required=clock == "auto", notes=notes)
+    audit = None if compared is None else compared.audit
     if isinstance(clock, int | float) and not isinstance(clock, bool):
         if reader is None:
             raise RecordingError(f"clock={clock}: an offset is added to the reader's clock, which this table lacks.")
-        return reader + round(clock * 1e9), reader, audit
+        return _Times(_shifted(reader, clock), all_rows, reader, arrival, audit)
     if clock == "arrival" or reader is None:
-        if host is None:
+        if arrival is None:
             raise RecordingError("clock=arrival: the table has no arrival times. Use clock=reader or an offset.")
-        return host, reader, audit
-    if clock == "auto" and audit is not None:
+        return _Times(arrival, all_rows, reader, arrival, audit)
+    if clock == "auto" and compared is not None:
+        notes += _clock_notes(compared.audit)
+        return _Times(compared.time_ns, compared.usable, reader, arrival, audit)
+    return _Times(reader, all_rows, reader, arrival, audit)
+
+
+def _compare_clocks(
+    reader: np.ndarray | None, arrival: np.ndarray | None, *, required: bool, notes: list[str]
+) -> HostTimes | None:
+    """The comparison of both clocks; None without both. A fault is an error if `required`, otherwise a note."""
+    if reader is None or arrival is None or len(reader) < 2:
+        return None
+    try:
+        return to_host_clock(reader, arrival)
+    except RecordingError as error:
+        if required:
+            raise
+        notes.append(f"the two clocks of the table do not agree: {error}")
+        return None
+
+
+def _shifted(reader: np.ndarray, seconds: float) -> np.ndarray:
+    """Reader times plus an offset. Raises `RecordingError` for an offset that leaves the range of times."""
+    offset_ns = round(seconds * 1e9) if math.isfinite(seconds) else _MAX_TIME_NS + 1
+    if not (int(reader.min()) + offset_ns >= 0 and int(reader.max()) + offset_ns <= _MAX_TIME_NS):
+        raise RecordingError(f"clock={seconds}: times would lie outside 1970 to 2262; expected seconds to add.")
+    return reader + offset_ns
+
+
+def _clock_notes(audit: ClockAudit) -> list[str]:
+    """How the reader's times were converted to the host's clock, in a line for each piece."""
+    notes = []
+    for number, piece in enumerate(audit.pieces, 1):
+        low, high = piece.offset_interval_s
+        drift = "too short for a drift"
+        if piece.drift_interval_ppm is not None:
+            low_ppm, high_ppm = piece.drift_interval_ppm
+            drift = f"drift {piece.drift_ppm:.1f} ppm (95 %: {low_ppm:.1f} to {high_ppm:.1f})"
+        which = f" (piece {number} of {len(audit.pieces)}, {piece.num_reads} reads)" if len(audit.pieces) > 1 else ""
         notes.append(
-            f"reader times converted to the host's clock: offset {audit.offset_s:.3f} s, drift {audit.drift_ppm:.1f} ppm, "
-            f"residual {audit.residual_ms:.2f} ms"
+            f"reader times converted to the host's clock{which}: offset {piece.offset_s:.4f} s (95 %: {low:.4f} to {high:.4f}), "
+            f"{drift}"
         )
-        return to_host_ns(reader, audit), reader, audit
-    return reader, reader, audit
+    if len(audit.pieces) > 1:
+        notes.append(f"a clock was set anew or restarted {len(audit.pieces) - 1} times")
+    return notes
 
 
 def _carriers(
