@@ -25,7 +25,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from tagjax.core.machine import machine
     from tagjax.core.results import write_json
 
-    console = Console(width=None if sys.stdout.isatty() else 140)  # a file has no terminal width
+    console = Console(width=None if sys.stdout.isatty() else 140, markup=False)  # a file has no terminal width
     settings, timings = checked(BenchmarkSettings, values, folder), []
     table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s", "memory, MiB")
     with console.status("measuring") as status:

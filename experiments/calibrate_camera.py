@@ -27,7 +27,10 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     if values["pictures"] is None:
         raise ValueError("found no pictures; expected pictures=<folder of pictures of the checkerboard>.")
-    settings, console = checked(CalibrateSettings, values, folder), Console(soft_wrap=True, highlight=False)
+    settings, console = (
+        checked(CalibrateSettings, values, folder),
+        Console(soft_wrap=True, highlight=False, markup=False),
+    )
     calibration = calibrate_folder(settings)
     write_calibration(calibration, settings.out)
     drawn = write_corners(calibration, settings.out)

@@ -23,7 +23,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.compare import CompareConfig, console_table, run_comparison
 
-    progress, console = values.pop("progress"), Console()
+    progress, console = values.pop("progress"), Console(markup=False)
     config = from_mapping(CompareConfig, {**values, "suites": suites_named(values["suites"])})
     write_config(values, folder)
     with console.status("comparing") as status:

@@ -11,9 +11,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
-from .command import command, plain_values, print_result, write_config
+from .command import command, print_result, write_config
+from .run_folder import read_configuration
 from .suites import suite_recordings
 
 
@@ -24,9 +23,7 @@ def run_configuration(run: str | None) -> dict[str, Any] | None:
     path = Path(run) / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"run={run}: found no {path}; expected a run folder of experiments.train.")
-    config = OmegaConf.load(path)
-    assert isinstance(config, DictConfig)
-    return plain_values(config)
+    return read_configuration(path)
 
 
 @command
@@ -45,7 +42,7 @@ def main(values: dict[str, Any], folder: Path) -> float:
         config = from_mapping(EvaluateConfig, values)
     write_config(values, folder)
     summary = run_evaluation(config, folder, run_values=run_configuration(config.run))
-    Console().print(score_table(summary, title=f"report: {folder}"))
+    Console(markup=False).print(score_table(summary, title=f"report: {folder}"))
     print_result(summary)
     iou = next(iter(summary.values()))["all"].get("iou")
     return float("nan") if iou is None else float(iou)

@@ -19,7 +19,7 @@ def main(values: dict[str, Any], folder: Path) -> float:
 
     from tagjax.evaluation.flow import FlowEvaluationSettings, evaluate_flows, flow_tables
 
-    console = Console()
+    console = Console(markup=False)
     summary = evaluate_flows(checked(FlowEvaluationSettings, values, folder), folder)
     for table in flow_tables(summary):
         console.print(table)

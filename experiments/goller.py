@@ -21,7 +21,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from tagjax.baselines.goller.experiment import GollerExperiment, run_goller
     from tagjax.recording.store import open_recording
 
-    config, console = checked(GollerExperiment, values, folder), Console()
+    config, console = checked(GollerExperiment, values, folder), Console(markup=False)
     with console.status("tracking", spinner="line") as status:
         metrics = run_goller(config, folder, open_recording=open_recording, on_progress=status.update)
     console.print((folder / "tables.md").read_text(), markup=False)

@@ -19,7 +19,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from tagjax.recording.importers.settings import ImportSettings, import_recording
 
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False)
     _, lines = import_recording(checked(ImportSettings, values, folder))
     for line in lines:
         console.print(line, markup=False)

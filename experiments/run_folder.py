@@ -1,4 +1,4 @@
-"""The configuration in a run folder: a run resumes only with the configuration that it was started with."""
+"""The configuration in a run folder: how it is read, and that a run resumes only with the one that it was started with."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import yaml
 
 from .command import write_config
+
+_MAX_BYTES = 1_000_000
 
 _MAY_DIFFER = (
     "loop",
@@ -37,7 +39,7 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
     if checkpoint_steps(folder) and path.is_file():
         if not values.get("resume", True):
             return
-        before = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+        before = read_configuration(path)
         differences = _differences(before, dict(values), retune=bool(values.get("retune", False)))
         if differences:
             raise ValueError(
@@ -45,6 +47,33 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
                 "(retune=true allows another clip_norm and other numbers of the optimiser), or another folder."
             )
     write_config(values, folder)
+
+
+def read_configuration(path: Path) -> dict[str, Any]:
+    """The plain values of a run folder's config.yaml, which may come from elsewhere: nothing in it is interpreted.
+
+    Raises `ValueError` for a file that is missing, too large or no YAML mapping, and for interpolations (`${...}`) and
+    YAML aliases, which the commands never write.
+    """
+    expected = "expected the config.yaml of a run folder, as `python -m experiments.train` writes it."
+    try:
+        with path.open("rb") as file:
+            text = file.read(_MAX_BYTES + 1)
+        if len(text) > _MAX_BYTES:
+            raise ValueError(f"more than {_MAX_BYTES} bytes")
+        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"the alias *{event.anchor}")
+            if isinstance(event, yaml.ScalarEvent) and "${" in event.value:
+                raise ValueError(f"the interpolation {event.value[:60]!r}")
+        values = yaml.safe_load(text)
+    except RecursionError:
+        raise ValueError(f"{path}: found too deep a nesting; {expected}") from None
+    except (OSError, ValueError, OverflowError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: found {' '.join(str(error).split())}; {expected}") from error
+    if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
+        raise ValueError(f"{path}: found {type(values).__name__} that is no mapping of names; {expected}")
+    return values
 
 
 def checkpoint_steps(folder: Path) -> list[int]:

@@ -31,7 +31,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     config = checked(SimulateConfig, values, folder)
     suite = from_mapping(Suite, config.suite, where="suite")
     suite = suite.smoke() if config.smoke else suite
-    recordings_dir, console = Path(config.recordings_dir), Console()
+    recordings_dir, console = Path(config.recordings_dir), Console(markup=False)
     if config.sheet is not None:
         console.print(f"{suite.name}: {save_preview(suite, Path(config.sheet), workers=config.workers or 1)}")
         return

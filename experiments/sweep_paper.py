@@ -26,7 +26,7 @@ def main(values: dict[str, Any], folder: Path) -> float:
 
     from .progress import counting_bar
 
-    progress, console = values.pop("progress"), Console()
+    progress, console = values.pop("progress"), Console(markup=False)
     config = from_mapping(SweepConfig, {**values, "suites": suites_named(values["suites"])})
     write_config(values, folder)
     with counting_bar(console, shown=progress) as bar:

@@ -29,7 +29,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     if command_name not in ("run", "train"):
         raise ValueError(f"command is {command_name!r}; expected run or train.")
     suites_named(values["suites"])
-    config, console = from_mapping(TagviewExperiment, values), Console()
+    config, console = from_mapping(TagviewExperiment, values), Console(markup=False)
     write_config({"command": command_name, **values}, folder)
     with Progress(console=console, disable=not progress) as bar:
         task = bar.add_task("tagview", total=None)

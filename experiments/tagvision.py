@@ -20,7 +20,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from tagjax.baselines.tagvision.experiment import TagVisionExperiment, report_markdown, run_tagvision
 
-    progress, console = values.pop("progress"), Console()
+    progress, console = values.pop("progress"), Console(markup=False)
     config = checked(TagVisionExperiment, values, folder)
     with console.status("TagVision") as status:
         metrics = run_tagvision(config, folder, on_progress=status.update if progress else None)

@@ -25,7 +25,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     if values.get("folder") is None:
         raise ValueError("found no folder; expected folder=<folder with kinect-rfid/ or xovis-uwb/>.")
-    config, console = checked(TracksConfig, values, folder), Console()
+    config, console = checked(TracksConfig, values, folder), Console(markup=False)
     with console.status("scoring", spinner="line") as status:
         run_tracks(config, folder, on_done=status.update)
     console.print((folder / "tables.md").read_text(), markup=False)

@@ -589,7 +589,7 @@ def test_flow_files_name_every_setting(name):
     settings = yaml.safe_load((CONF / f"{name}.yaml").read_text())
     given = set(settings) - {"_target_"}
     if name == "pyramid":
-        built = eqx.filter_eval_shape(build, settings)
+        built = eqx.filter_eval_shape(make_network, settings)
         assert eqx.tree_equal(built, eqx.filter_eval_shape(PyramidFlow))
         assert given == set(inspect.signature(PyramidFlow).parameters) - {"seed"}
     else:
@@ -602,7 +602,7 @@ def test_flow_files_name_every_setting(name):
 @pytest.mark.parametrize("name", ["pyramid", "pyramid_fast"])
 def test_packaged_weights_are_those_of_the_configured_network(name):
     with initialize_config_dir(str(CONF.parent), version_base="1.3"):
-        network = eqx.filter_eval_shape(build, dict(compose("train_flow", [f"flow={name}"]).flow))
+        network = eqx.filter_eval_shape(make_network, dict(compose("train_flow", [f"flow={name}"]).flow))
     _same(load_weights(network), load_network(name))
 
 

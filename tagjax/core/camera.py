@@ -11,6 +11,9 @@ import numpy as np
 
 from .errors import RecordingError
 
+MAX_SIDE_PX = 16384
+"""Longest side of an image that a recording may have."""
+
 _NUM_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
 
 
@@ -55,6 +58,18 @@ class Intrinsics:
             if not _finite(value) or (name in ("fx_px", "fy_px") and value <= 0):
                 kind = "positive" if name in ("fx_px", "fy_px") else "finite"
                 raise RecordingError(f"Intrinsics: {name} is {value!r}; expected a {kind} number of pixels.")
+        longest = max(self.width, self.height)
+        if longest > MAX_SIDE_PX:
+            raise RecordingError(
+                f"Intrinsics: {self.width} x {self.height}; expected at most {MAX_SIDE_PX} pixels a side."
+            )
+        for name in ("fx_px", "fy_px"):
+            value = getattr(self, name)
+            if not 0.1 * longest <= value <= 1000 * longest:
+                raise RecordingError(
+                    f"Intrinsics: {name} is {value:.4g} for images of {self.width} x {self.height}; expected pixels, 0.1 to 1000 "
+                    "times the longer side. Millimetres, or intrinsics of another resolution, must be converted first."
+                )
         if len(self.distortion) not in _NUM_COEFFICIENTS or not all(map(_finite, self.distortion)):
             raise RecordingError(
                 f"Intrinsics: distortion is {self.distortion!r}; expected finite k1 k2 p1 p2 k3, in a number that OpenCV takes "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from rich.table import Table
 
 from ..core.files import write_atomic
 from ..core.machine import machine
+from ..core.names import safe_file_name
 from ..core.results import write_json
 from ..flow.opencv import FlowFunction
 from ..flow.registry import flow_key, make_flow, split_suffixes
@@ -176,8 +176,7 @@ class _Scored:
             kept[case.source] = kept.get(case.source, FlowScores()).merge(score)
         if panels is not None:
             panels.mkdir(parents=True, exist_ok=True)
-            name = re.sub(r"[^\w.-]+", "_", case.label)
-            cv2.imwrite(str(panels / f"{name}.png"), _panel(case, predicted)[..., ::-1])
+            cv2.imwrite(str(panels / f"{safe_file_name(case.label)}.png"), _panel(case, predicted)[..., ::-1])
 
     def _call(self, name: str, case: FlowCase) -> np.ndarray:
         start = time.perf_counter()

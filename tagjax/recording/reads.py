@@ -106,12 +106,24 @@ class TagReads:
     def check(self) -> None:
         """Raise `RecordingError` for reads that cannot be used; warn of unusual reads that can be used."""
         num_reads = self.num_reads
-        for field in dataclasses.fields(self):
-            column = getattr(self, field.name)
-            if isinstance(column, np.ndarray) and column.shape != (num_reads,):
+        for name, kinds in _COLUMN_KINDS.items():
+            column = getattr(self, name)
+            if column is not None and (column.shape != (num_reads,) or column.dtype.kind not in kinds):
                 raise RecordingError(
-                    f"Tag reads: column {field.name} has shape {column.shape}; expected ({num_reads},) like time_ns."
+                    f"Tag reads: column {name} is {column.dtype} of shape {column.shape}; expected {_KINDS[kinds]}, "
+                    f"({num_reads},) like time_ns."
                 )
+        if self.phase_sign not in (-1, 1):
+            raise RecordingError(
+                f"Tag reads: phase_sign is {self.phase_sign!r}; expected 1 (phase grows with distance) or -1."
+            )
+        period = self.phase_period_rad
+        if not isinstance(period, int | float) or not 0.1 <= period <= 2 * np.pi + 1e-6:
+            raise RecordingError(
+                f"Tag reads: phase_period_rad is {period!r}; expected radians, 2 pi, or pi for a reader with flips."
+            )
+        if not all(isinstance(carrier, int | float) and 300e6 <= carrier <= 6e9 for carrier in self.hop_table_hz):
+            raise RecordingError(f"Tag reads: hop_table_hz is {self.hop_table_hz!r}; expected UHF carriers in Hz.")
         if num_reads == 0:
             warnings.warn("The recording has no tag read: nothing can be traced.", RecordingWarning, stacklevel=3)
             return
@@ -121,16 +133,15 @@ class TagReads:
                 f"Tag reads: time goes back at read {first}; expected reads in order of time. "
                 "Sort them (the importers do)."
             )
-        for name, limit, unit in (("phase_rad", self.phase_period_rad + 1e-6, "rad"),):
-            column = getattr(self, name)
-            if not np.all(np.isfinite(column)):
-                bad = int(np.sum(~np.isfinite(column)))
-                raise RecordingError(f"Tag reads: {bad} of {num_reads} values of {name} are not finite; drop them.")
-            if column.min() < -1e-6 or column.max() > limit:
-                raise RecordingError(
-                    f"Tag reads: {name} spans [{column.min():.4g}, {column.max():.4g}]; expected [0, {limit:.4g}] {unit}. "
-                    "Degrees or raw codes must be converted first."
-                )
+        phase = self.phase_rad
+        if not np.all(np.isfinite(phase)):
+            bad = int(np.sum(~np.isfinite(phase)))
+            raise RecordingError(f"Tag reads: {bad} of {num_reads} values of phase_rad are not finite; drop them.")
+        if phase.min() < -1e-6 or phase.max() > period + 1e-6:
+            raise RecordingError(
+                f"Tag reads: phase_rad spans [{phase.min():.4g}, {phase.max():.4g}]; expected [0, {period:.4g}] rad. "
+                "Degrees or raw codes must be converted first."
+            )
         known = np.isfinite(self.carrier_hz)
         if not known.all():
             warnings.warn(
@@ -158,3 +169,18 @@ class TagReads:
             )
         if np.any(self.antenna < 1):
             raise RecordingError(f"Tag reads: antenna {int(self.antenna.min())} found; antennas are counted from 1.")
+
+
+_KINDS = {"U": "text", "i": "integers", "f": "floats"}
+_COLUMN_KINDS = {
+    "epc": "U",
+    "time_ns": "i",
+    "antenna": "i",
+    "carrier_hz": "f",
+    "phase_rad": "f",
+    "rssi_dbm": "f",
+    "doppler_hz": "f",
+    "reader_time_ns": "i",
+    "arrival_time_ns": "i",
+    "channel_index": "i",
+}

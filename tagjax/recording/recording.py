@@ -16,6 +16,7 @@ import numpy as np
 from ..core.camera import Intrinsics
 from ..core.errors import RecordingError, RecordingWarning
 from ..core.types import LazyArray
+from .checks import check_geometry, check_names, check_time_of_reads, check_truth
 from .reads import TagReads
 
 MAX_RANGE_M = 30.0
@@ -135,6 +136,7 @@ class Recording:
         num_frames, shape = self.num_frames, self.image_shape
         if num_frames == 0:
             raise RecordingError(f"{self.name}: no frames; expected at least one.")
+        check_names(self)
         self.intrinsics.check()
         if self.colour.shape != (num_frames, *shape, 3) or self.colour.dtype != np.uint8:
             raise RecordingError(
@@ -148,6 +150,11 @@ class Recording:
             )
         if depth and np.dtype(self.depth.dtype) not in (np.dtype(np.uint16), np.dtype(np.float32)):
             raise RecordingError(f"{self.name}: depth is {self.depth.dtype}; expected uint16 mm or float32 m.")
+        if np.dtype(self.time_ns.dtype) != np.int64 or self.time_ns.ndim != 1:
+            raise RecordingError(
+                f"{self.name}: time_ns is {self.time_ns.dtype} of shape {self.time_ns.shape}; expected int64 nanoseconds, one "
+                "for each frame."
+            )
         steps = np.diff(self.time_ns)
         if np.any(steps <= 0):
             first = int(np.argmax(steps <= 0)) + 1
@@ -155,10 +162,9 @@ class Recording:
                 f"{self.name}: frame {first} is stamped {int(-steps[first - 1]) / 1e6:.3f} ms before or at frame {first - 1}; "
                 "expected strictly increasing times. Drop or re-stamp the frame."
             )
-        if self.antennas_m.ndim != 2 or self.antennas_m.shape[1] != 3 or not np.all(np.isfinite(self.antennas_m)):
-            raise RecordingError(
-                f"{self.name}: antennas_m has shape {self.antennas_m.shape}; expected finite (antennas, 3) metres."
-            )
+        check_geometry(self)
+        if self.truth is not None:
+            check_truth(self.truth, self.name, num_frames, shape)
         if depth:
             self._check_depth_values()
         self.reads.check()
@@ -168,13 +174,7 @@ class Recording:
                 raise RecordingError(
                     f"{self.name}: reads of antenna {highest}, but antennas_m has {len(self.antennas_m)} positions. Give the position of every antenna."
                 )
-            inside = (self.reads.time_ns >= self.time_ns[0]) & (self.reads.time_ns <= self.time_ns[-1])
-            if not inside.any():
-                gap_s = (int(self.reads.time_ns[0]) - int(self.time_ns[0])) * 1e-9
-                raise RecordingError(
-                    f"{self.name}: no read falls between the first and the last frame (first read {gap_s:+.1f} s from the "
-                    "first frame). Reader and camera clocks differ: import with clock=arrival, or with clock=<seconds to add to the reader's clock>."
-                )
+            check_time_of_reads(self)
 
     def check_has_depth(self) -> None:
         """Raise `RecordingError` if none of the frames that `check` samples has any depth."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
+from rich.markup import escape
 from rich.progress import Progress
 
 from ..core.camera import Intrinsics
@@ -59,7 +60,7 @@ def write_recording(recording: Recording, root: zarr.Group, *, progress: bool = 
     with Progress(disable=not progress, transient=True) as bar:
         for name, source in frames.items():
             target = create_array(root, name, tuple(source.shape), source.dtype, per_frame=True)
-            for t in bar.track(range(source.shape[0]), description=f"{recording.name}: {name}"):
+            for t in bar.track(range(source.shape[0]), description=escape(f"{recording.name}: {name}")):
                 target[t] = np.asarray(source[t])
     for name, values in arrays.items():
         target = create_array(root, name, values.shape, values.dtype, per_frame=False)
@@ -200,6 +201,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
     columns["epc"] = (
         np.asarray(attributes["epcs"], dtype=str)[columns["epc"]] if attributes["epcs"] else np.empty(0, str)
     )
+    _check_unique(attributes["epcs"], "epcs", path)
     stored = dict(attributes["reads"])
     stored["hop_table_hz"] = tuple(stored["hop_table_hz"])
     reads = TagReads(**columns, **stored)
@@ -210,6 +212,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         tables: dict[str, dict[Any, np.ndarray]] = {}
         for name in _TRUTH_TABLES:
             keys = attributes["truth"].get(name, ())  # older recordings have no line_of_sight
+            _check_unique(keys, f"truth.{name}", path)
             tables[name] = {key: array(f"truth/{name}/{number}")[...] for number, key in enumerate(keys)}
         truth = Truth(
             **{name: array(f"truth/{name}") for name in _TRUTH_ARRAYS if has(f"truth/{name}")},  # type: ignore[arg-type]
@@ -233,6 +236,14 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         source=attributes["source"],
         store=root if writable else None,
     )
+
+
+def _check_unique(names: Sequence[Any], what: str, path: str) -> None:
+    repeated = {str(name) for name in names if names.count(name) > 1}
+    if repeated:
+        raise RecordingError(
+            f"{path}: {what} lists {', '.join(sorted(repeated))} more than once; expected each name once."
+        )
 
 
 def _clock(stored: dict[str, Any], reads: TagReads) -> ClockAudit:

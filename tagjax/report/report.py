@@ -12,6 +12,7 @@ import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 
+from ..core.names import plain_label, safe_file_name
 from ..core.results import write_csv, write_json
 from ..metrics.recordings import RecordingResult
 from ..metrics.tracking import Scores, label_box
@@ -45,7 +46,9 @@ def write_report(folder: Path, results: Results) -> dict[str, Any]:
     write_frames(folder / "frames.csv", results)
     for tracer, ones in results.items():
         for number, one in enumerate(ones):
-            write_overlays(folder / "overlays" / _recording_name(ones, number) / tracer, one)
+            write_overlays(
+                folder / "overlays" / safe_file_name(_recording_name(ones, number)) / safe_file_name(tracer), one
+            )
     write_curves(folder / "curves", results)
     return summary
 
@@ -114,7 +117,8 @@ def write_curves(folder: Path, results: Results) -> None:
                 }
             name = _recording_name(reference, number)
             offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
-            score_curves(folder / f"{name}_{epc}.png", lines, frames.valid, first_frame=offset, title=f"{name}: {epc}")
+            path = folder / f"{safe_file_name(f'{name}_{epc}')}.png"
+            score_curves(path, lines, frames.valid, first_frame=offset, title=plain_label(f"{name}: {epc}"))
 
 
 def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:

@@ -64,7 +64,7 @@ def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console
     (`config.distributed`) only process 0 writes.
     """
     with distributed_runtime(config.distributed):
-        return _run(config, folder, console or Console(quiet=not is_first()))
+        return _run(config, folder, console or Console(quiet=not is_first(), markup=False))
 
 
 def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:

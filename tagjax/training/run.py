@@ -74,7 +74,7 @@ def run_training(config: TrainConfig, folder: Path, *, console: Console | None =
     An interrupted run writes a checkpoint, returns NaN, and resumes when started again in the same folder. With several
     processes (`config.distributed`) process 0 writes and evaluates; the others return NaN.
     """
-    console = console or Console()
+    console = console or Console(markup=False)
     with distributed_runtime(config.distributed):  # before JAX's devices are used for the first time
         smoothing_tracers({"learned": make_tracer(config.tracer)}, config.scores)
         console.quiet = console.quiet or not is_first()

@@ -14,6 +14,7 @@ import scipy.io
 from ...core.camera import Intrinsics
 from ...core.errors import RecordingError
 from ...core.geometry import register_depth, undistort
+from ...core.names import valid_name
 from ..image_files import natural_sorted, read_colour, read_image, read_labels
 from ..reads import TagReads
 from ..recording import Recording, Truth
@@ -178,7 +179,7 @@ def import_jpg_mat(
         intrinsics=view.colour_camera,
         reads=TagReads.empty(),
         truth=truth,
-        name=name or folder.name,
+        name=valid_name(name or folder.name),
         source=f"jpg + mat folder {folder.name}, {fps:g} frames/s assumed",
     )
 
@@ -258,7 +259,7 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
         time_ns=np.array([round(stamp * 1e9) for stamp, _, _ in pairs], np.int64),
         intrinsics=dataclasses.replace(lens, distortion=()),
         reads=TagReads.empty(),
-        name=folder.name,
+        name=valid_name(folder.name),
         source=f"TUM RGB-D {folder.name}; {dropped} of {len(listings['rgb'])} images without depth left out{removed}",
     )
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ....core.files import write_atomic
+from ....core.names import plain_label
 from ....core.results import write_json
 from ....recording import Recording
 from ....recording.suite_folder import SPLITS, SuiteRecording, find_recordings
@@ -232,7 +233,7 @@ def _handovers(
                     states[row],
                     np.asarray(estimates.location.position_m[row, :, 0]),
                     true_m[:, 0],
-                    title=f"{recording.name}, tag {epc[-4:]}",
+                    title=plain_label(f"{recording.name}, tag {epc[-4:]}"),
                 )
         if number == 0:
             threshold = float(calibration.alarm_threshold)

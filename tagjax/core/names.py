@@ -1,0 +1,49 @@
+"""Names of recordings and tags: which are allowed, and how any text becomes a file name or is shown as it is."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+MAX_NAME = 100
+"""Longest name of a recording, and longest EPC, in characters."""
+
+_NAME = re.compile(r"\w[\w .,()+@#:-]*")
+_NOT_IN_FILES = re.compile(r"[^\w.+-]+")
+_MAX_FILE_NAME = 80
+
+
+def name_fault(name: object) -> str | None:
+    """Why a text can be no name of a recording or tag; None if it can.
+
+    Letters and digits of any script, space and `_ . , ( ) + @ # : -` are allowed, a letter, digit or `_` first.
+    """
+    if not isinstance(name, str):
+        return f"found {name!r} ({type(name).__name__}); expected a text"
+    if len(name) > MAX_NAME:
+        return f"found {name[:20]!r}... of {len(name)} characters; expected at most {MAX_NAME}"
+    if not _NAME.fullmatch(name) or name != name.strip():
+        return f"found {name!r}; expected letters, digits, spaces and _.,()+@#:- only, a letter or digit first"
+    return None
+
+
+def safe_file_name(text: str) -> str:
+    """A file name that stays in its folder, on every system: `text` itself if it is one already.
+
+    Other characters become `_`. A short digest of the text follows wherever something was changed, so that two texts
+    never share a file name.
+    """
+    safe = _NOT_IN_FILES.sub("_", text).strip("._ ")[:_MAX_FILE_NAME]
+    if safe == text and safe:
+        return safe
+    return f"{safe or 'name'}-{hashlib.sha256(text.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
+
+
+def valid_name(text: str) -> str:
+    """The text itself if it can be a recording's name, else a file name made of it."""
+    return text if name_fault(text) is None else safe_file_name(text)
+
+
+def plain_label(text: str) -> str:
+    """A text as matplotlib shows it unchanged: `$` does not begin a formula."""
+    return text.replace("$", r"\$")
