@@ -56,7 +56,7 @@ def test_a_run_folder_calls_nothing_but_the_classes_of_each_place(call, tmp_path
     values = {"tracer": TRACER, "optimizer": ADAM, **_filled(CALLS[call], str(marker))}
     OmegaConf.save(OmegaConf.create(values), run / "config.yaml")
     config = from_mapping(EvaluateConfig, {"run": str(run), "recordings": ["nowhere.zarr"]})
-    with pytest.raises(ValueError, match="run|_target_|heckpoint") as refusal:
+    with pytest.raises(ValueError, match=r"run|_target_|heckpoint") as refusal:
         run_evaluation(config, tmp_path / "out", run_values=read_configuration(run / "config.yaml"))
     assert not marker.exists()
     if call != "in a baseline":  # there the missing checkpoint is found first

@@ -1,0 +1,1 @@
+"""Trials of faults: bad input and interruptions, tried and failed by kind."""
