@@ -418,7 +418,7 @@ def test_damaged_foreign_and_unfit_files_are_refused_in_words(tmp_path):
     refused("a safetensors file, but no weights")
     for other, message in (
         ({**metadata, "format": "other"}, "a safetensors file, but no weights"),
-        ({**metadata, "version": 2}, "version 2; this release reads version 1"),
+        ({**metadata, "version": 7}, "version 7; this release reads version 2"),
         ([1], "a safetensors file, but no weights"),
     ):
         _rewritten(good, bad, metadata=other)
