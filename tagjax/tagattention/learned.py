@@ -197,7 +197,8 @@ def _read(path: Path) -> Learned:
     clips = dict(content["clips"])
     if isinstance(flow := clips.get("flow"), str) and _is_file(path.parent / flow):
         clips["flow"] = str(path.parent / flow)
-    return Learned(path, content["settings"], clips, content["parameters"], default)
+    parameters = {name: float(value) for name, value in content["parameters"].items()}
+    return Learned(path, content["settings"], clips, parameters, default)
 
 
 def _content(path: Path) -> dict[str, Any]:
