@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import dataclasses
+import itertools
 import json
 from collections.abc import Callable, Sequence
 
@@ -136,7 +137,7 @@ def _r700(row: Row) -> Read:
 class Format:
     """A table format: the columns that identify it, how a row becomes a read, and where the header is.
 
-    `layout` is "csv" (the first line is the header), "commented_csv" (the last line that begins with // is the header) or
+    `layout` is "csv" (the first line is the header), "commented_csv" (of the first lines, which begin with //, the last is the header) or
     "json_lines" (each line is an event; there is no header).
     """
 
@@ -152,7 +153,7 @@ class Format:
         """
         if self.layout == "json_lines":
             return lambda line: {"line": line}, lines
-        comments = [line for _, line in lines if _is_comment(line)] if self.layout == "commented_csv" else []
+        comments = _first_comments([line for _, line in lines]) if self.layout == "commented_csv" else []
         if self.layout == "commented_csv" and not comments:
             raise RowError("the header is missing: expected a line that begins with //")
         header = comments[-1].lstrip().removeprefix("//").strip() if comments else lines[0][1]
@@ -166,6 +167,11 @@ class Format:
 
 def _is_comment(line: str) -> bool:
     return line.lstrip().startswith("//")
+
+
+def _first_comments(lines: Sequence[str]) -> list[str]:
+    """The comments above the first row. Of later ones none is a header: a damaged row may begin like a comment."""
+    return list(itertools.takewhile(_is_comment, lines))
 
 
 FORMATS: dict[str, Format] = {
@@ -189,9 +195,9 @@ def recognise(lines: Sequence[str]) -> Format | None:
     head = [line.strip() for line in lines[:20] if line.strip()]
     if not head:
         return None
-    if head[0].startswith("{"):
-        return FORMATS["r700"] if any("EventType" in line or "eventType" in line for line in head) else None
-    comments = [line for line in head if _is_comment(line)]
+    if any(line.startswith("{") and ("EventType" in line or "eventType" in line) for line in head):
+        return FORMATS["r700"]
+    comments = _first_comments(head)
     try:
         columns = {
             name.strip().strip('"') for name in csv_fields(comments[-1].removeprefix("//") if comments else head[0])
