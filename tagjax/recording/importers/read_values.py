@@ -30,10 +30,10 @@ class Read:
 
 
 def number(row: Row, name: str) -> float:
-    """A finite number of a column, in ASCII digits. Raises `RowError`."""
+    """A finite number of a column, in ASCII digits. Raises `RowError`, and `KeyError` without the column."""
     try:
         value = float(_plain_digits(row[name]))
-    except (KeyError, AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise RowError(f"{name} is not a number") from error
     if not math.isfinite(value):
         raise RowError(f"{name} is not finite")
@@ -41,10 +41,10 @@ def number(row: Row, name: str) -> float:
 
 
 def integer(row: Row, name: str) -> int:
-    """An integer of a column, in ASCII digits. Raises `RowError`."""
+    """An integer of a column, in ASCII digits. Raises `RowError`, and `KeyError` without the column."""
     try:
         return int(_plain_digits(row[name]))
-    except (KeyError, AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise RowError(f"{name} is not an integer") from error
 
 
