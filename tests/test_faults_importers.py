@@ -226,7 +226,7 @@ def test_bad_rows_of_tracks_are_left_out_with_a_warning(tmp_path: Path) -> None:
     bad = ["1,1,0,0,1", "99,1,0,0,1", "2,0,0,0,1", "3,5,inf,0,1", "4,6,1e9,0,1", '"']
     path.write_text("\n".join([*lines, *bad]))
     with pytest.warns(
-        RecordingWarning, match=r"tracks.csv: 6 of 22 rows rejected \(1: columns are missing \(line 23\)"
+        RecordingWarning, match=r"tracks.csv: 6 of 22 rows rejected \(1: frame is not an integer \(line 23\)"
     ):
         tracks = load_tracks_csv(path, np.arange(8) / 30)
     assert list(tracks) == [1, 2]

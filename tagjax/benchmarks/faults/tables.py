@@ -19,7 +19,7 @@ from ...recording.importers.rgbd_folder import import_tum
 from ...recording.importers.tables import import_table
 from ...recording.importers.tagged_walks import read_kinect, read_speeds, read_xovis
 from ...recording.virtual_tags import load_tracks_csv
-from .bytes import damaged_bytes
+from .damaged_bytes import damaged_bytes
 from .outcome import Outcome, TimeLimitError, joined, outcome, time_limit, unclear
 from .sound_tables import HOP_TABLE_HZ, TIME_COLUMNS, WRITERS, sound_lines, sound_reads, sound_tracks
 

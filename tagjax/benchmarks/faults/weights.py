@@ -15,7 +15,7 @@ from ...core.array_file import ArrayFile
 from ...core.json_text import json_checksum
 from ...tagattention import TagAttention
 from ...tagattention.learned import load_parameters, read_learned, save_parameters
-from .bytes import damaged_bytes
+from .damaged_bytes import damaged_bytes
 from .outcome import Outcome, TimeLimitError, outcome, time_limit, unclear
 
 LIMIT_S = 20.0
