@@ -15,6 +15,8 @@ import pytest
 import safetensors.numpy
 import synthetic_clips as synthetic
 
+from tagjax.baselines.goller import calibration as goller
+from tagjax.baselines.tagvision import plane as tagvision
 from tagjax.benchmarks.faults import weights as weight_faults
 from tagjax.core.array_file import ArrayFile
 from tagjax.core.json_text import json_checksum, not_float32, parse_json
@@ -214,6 +216,15 @@ def test_a_position_in_the_data_that_is_none_is_refused(tmp_path: Path, state: T
         samples = StreamIterator.__new__(StreamIterator)  # which refuses a position before it opens anything
         with pytest.raises(CheckpointError, match="The position in the data is") as error:
             resume_state(state, samples, checkpoints, allowed=True)
+    _one_line(error)
+
+
+@pytest.mark.parametrize("load", [tagvision.load_calibration, goller.load_calibration])
+def test_a_calibration_of_nested_json_is_refused(tmp_path: Path, load: Callable[[Path], Any]) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(NESTED)
+    with pytest.raises(ValueError, match="more than 32 levels") as error:
+        load(path)
     _one_line(error)
 
 
