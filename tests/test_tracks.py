@@ -139,7 +139,7 @@ def test_what_is_no_folder_of_tracks_is_refused(folder, tmp_path):
     with pytest.raises(RecordingError, match="0 tracks"):
         load_scenes(TracksConfig(str(tmp_path)))
     (tmp_path / "kinect-rfid" / "1-1-2020.txt").write_text("7, yesterday, 1, 2\n")
-    with pytest.raises(RecordingError, match=r"line 1.*Expected id, time"):
+    with pytest.raises(RecordingError, match=r"time is not year-month-day .*\(line 1\)\); expected id, time"):
         load_scenes(TracksConfig(str(tmp_path)))
     (tmp_path / "t.csv").write_text(";time;id;x\n")
     with pytest.raises(RecordingError, match="columns y are missing"):

@@ -168,9 +168,12 @@ def load_tagged(folder: Path, rate_hz: float) -> list[TaggedRecording]:
         beside = path.with_name(f"RFID_{path.name}")
         if not beside.is_file():
             continue
-        rows = {track_id: np.array(own) for track_id, own in read_kinect(path).items() if len(own) > 1}
+        tracks = {track_id: np.array(own) for track_id, own in read_kinect(path).items()}
+        rows = {track_id: own for track_id, own in tracks.items() if np.ptp(own[:, 0]) >= 2 / rate_hz}
         if not rows:
-            raise RecordingError(f"{path}: no track of two samples or more.")
+            raise RecordingError(
+                f"{path}: found no track of two samples or more; expected one of at least {2 / rate_hz:.2g} s. Leave the file out."
+            )
         start = min(own[0, 0] for own in rows.values())
         walks = tuple(_walk(track_id, own - np.array([start, 0.0, 0.0]), rate_hz) for track_id, own in rows.items())
         for epc, speeds in read_speeds(beside).items():
