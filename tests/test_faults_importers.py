@@ -135,6 +135,12 @@ def test_values_are_ascii_digits() -> None:
     assert clean_epc("b'ab cd'") == "ABCD"
 
 
+def test_spaces_in_a_header_do_not_matter(tmp_path: Path) -> None:
+    lines = _table("sllurp")
+    spaced = [lines[0].replace(",", " , "), *lines[1:]]
+    assert _import(tmp_path / "table", spaced)[0].num_reads == 12
+
+
 def test_headers_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     sllurp = _table("sllurp")
     with pytest.raises(RecordingError, match="column antenna is there twice"):

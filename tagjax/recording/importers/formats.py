@@ -137,8 +137,8 @@ def _r700(row: Row) -> Read:
 class Format:
     """A table format: the columns that identify it, how a row becomes a read, and where the header is.
 
-    `layout` is "csv" (the first line is the header), "commented_csv" (of the first lines, which begin with //, the last is the header) or
-    "json_lines" (each line is an event; there is no header).
+    `layout` is "csv" (the first line is the header), "commented_csv" (of the first lines, which begin with //, the last is
+    the header) or "json_lines" (each line is an event; there is no header).
     """
 
     name: str
@@ -157,7 +157,7 @@ class Format:
         if self.layout == "commented_csv" and not comments:
             raise RowError("the header is missing: expected a line that begins with //")
         header = comments[-1].lstrip().removeprefix("//").strip() if comments else lines[0][1]
-        columns = csv_fields(header)
+        columns = _column_names(header)
         names = [name.lower() if self.read is _itemtest else name for name in columns]
         if repeated := sorted(name for name in self.columns if names.count(name) > 1):
             raise RowError(f"column {repeated[0]} is there twice; expected it once")
@@ -167,6 +167,10 @@ class Format:
 
 def _is_comment(line: str) -> bool:
     return line.lstrip().startswith("//")
+
+
+def _column_names(header: str) -> list[str]:
+    return [name.strip().strip('"') for name in csv_fields(header)]
 
 
 def _first_comments(lines: Sequence[str]) -> list[str]:
@@ -199,9 +203,7 @@ def recognise(lines: Sequence[str]) -> Format | None:
         return FORMATS["r700"]
     comments = _first_comments(head)
     try:
-        columns = {
-            name.strip().strip('"') for name in csv_fields(comments[-1].removeprefix("//") if comments else head[0])
-        }
+        columns = set(_column_names(comments[-1].removeprefix("//") if comments else head[0]))
     except RowError:
         return None
     low = {name.lower() for name in columns}
