@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from ...core.array_file import ArrayFile
-from ...core.json_text import json_checksum
+from ...core.json_text import json_checksum, not_float32
 from ...tagattention import TagAttention
 from ...tagattention.learned import load_parameters, read_learned, save_parameters
 from .damaged_bytes import damaged_bytes
@@ -111,4 +111,7 @@ def _fault(values: Callable[[], Any], expected: Any) -> str | None:
             found = values()
     except (Exception, TimeLimitError) as error:
         return unclear(error, ValueError)
-    return "silently different" if expected is not None and found != expected else None
+    if expected is not None and found != expected:
+        return "silently different"
+    wrong = not_float32(found)
+    return f"accepted although not finite in float32: {', '.join(wrong[:3])}" if wrong else None
