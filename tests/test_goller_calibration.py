@@ -145,6 +145,7 @@ _SKEW, _MEAN = ".location.antennas.skew_m", ".location.antennas.mean_m"
         (".alarm_threshold", float("nan"), "expected finite numbers"),
         (".rssi_threshold_dbm", float("-inf"), "expected finite numbers"),
         (".rssi_threshold_dbm", 1e300, "finite as float32"),
+        (".rssi_threshold_dbm", 10**400, "expected finite numbers"),
         (_MEAN, [[0.0, 0.0], [1.0], [2.0, 0.0]], r"expected finite numbers of shape \(3, 2\)"),
         (_MEAN, [[0.0, 0.0]], r"is \[\[0\.0, 0\.0\]\]; expected finite numbers of shape \(3, 2\)"),
     ],

@@ -1,8 +1,5 @@
 """Properties of the importers of reader tables: what is written in a format is read back; garbage is counted."""
 
-import base64
-import datetime
-import json
 import warnings
 from pathlib import Path
 
@@ -11,116 +8,37 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from tagjax.benchmarks.faults.sound_tables import HOP_TABLE_HZ, WRITERS, SoundRead, sound_lines
 from tagjax.recording import RecordingError, RecordingWarning
 from tagjax.recording.importers.formats import FORMATS, recognise
 from tagjax.recording.importers.read_values import clean_epc
 from tagjax.recording.importers.tables import import_table
 
-TURN = 2 * np.pi
-HOP_TABLE_HZ = tuple(920.625e6 + 0.25e6 * number for number in range(16))
 START_US = 1_700_000_000_000_000  # microseconds since 1970
+
+WITH_PHASES = [name for name in WRITERS if name != "sllurp_log"]
 
 same_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @st.composite
 def tables(draw, min_size: int = 1):
-    """Reads as dictionaries, in order of time, with values that every format can write."""
+    """Reads in order of time, with values that every format can write."""
     time_us, reads = START_US, []
     for _ in range(draw(st.integers(min_size, 8))):
         time_us += 1000 * draw(st.integers(1, 100_000))  # a tagbeat table holds milliseconds of the host
         reads.append(
-            {
-                "epc": draw(st.sampled_from(["E2801191A503006543210ABC", "300833B2DDD9014000000000", "ABCD"])),
-                "time_us": time_us,
-                "antenna": draw(st.integers(1, 4)),
-                "channel": draw(st.integers(1, len(HOP_TABLE_HZ))),
-                "code": draw(st.integers(0, 4095)),  # phase in 1/4096 of a turn
-                "rssi_dbm": draw(st.integers(-90, -20)),
-                "doppler_hz": draw(st.integers(-40, 40)),
-            }
+            SoundRead(
+                epc=draw(st.sampled_from(["E2801191A503006543210ABC", "300833B2DDD9014000000000", "ABCD"])),
+                time_us=time_us,
+                antenna=draw(st.integers(1, 4)),
+                channel=draw(st.integers(1, len(HOP_TABLE_HZ))),
+                code=draw(st.integers(0, 4095)),
+                rssi_dbm=draw(st.integers(-90, -20)),
+                doppler_hz=draw(st.integers(-40, 40)),
+            )
         )
     return reads
-
-
-def _iso(time_us: int) -> str:
-    moment = datetime.datetime.fromtimestamp(time_us // 10**6, datetime.UTC)
-    return f"{moment:%Y-%m-%dT%H:%M:%S}.{time_us % 10**6:06d}0Z"
-
-
-def _phase(read) -> float:
-    return read["code"] * TURN / 4096
-
-
-def _mhz(read) -> str:
-    return f"{HOP_TABLE_HZ[read['channel'] - 1] / 1e6:.3f}"
-
-
-def _r700(read) -> str:
-    tag = {
-        "epc": base64.urlsafe_b64encode(bytes.fromhex(read["epc"])).decode().rstrip("="),
-        "antennaPort": read["antenna"],
-        "peakRssiCdbm": 100 * read["rssi_dbm"],
-        "frequency": round(HOP_TABLE_HZ[read["channel"] - 1] / 1e3),
-        "lastSeenTime": _iso(read["time_us"]),
-        "phaseAngle": read["code"] * 360 / 4096,
-    }
-    return json.dumps({"timestamp": tag["lastSeenTime"], "eventType": "tagInventory", "tagInventoryEvent": tag})
-
-
-WRITERS = {
-    "sllurp": (
-        "timestamp,reader,antenna,rssi,epc,phase_angle,channel_index,doppler_frequency",
-        lambda r: (
-            f"{r['time_us'] // 10**6}.{r['time_us'] % 10**6:06d},h,{r['antenna']},{r['rssi_dbm']},"
-            f"b'{r['epc'].lower()}',{r['code']},{r['channel']},{16 * r['doppler_hz']}"
-        ),
-    ),
-    "octane": (
-        '"EPC","Timestamp","ChannelInMhz","PeakRssiInDbm","PhaseAngleInRadians"',
-        lambda r: f'"{r["epc"][:4]} {r["epc"][4:]}","{r["time_us"]}","{_mhz(r)}","{r["rssi_dbm"]}","{_phase(r)!r}"',
-    ),
-    "octane_gesture": (
-        "EPC,DopplerShift(Hz),Time,Antenna,TxPower,Frequency(MHz),RSS(dbm),PhaseAngle(Radian),PhaseAngle(Degree)",
-        lambda r: (
-            f"{r['epc']},{r['doppler_hz']},{r['time_us']},{r['antenna']},30,{_mhz(r)},{r['rssi_dbm']},{_phase(r)!r},0"
-        ),
-    ),
-    "tagbeat": (
-        "EPC,AntnenaId,ChannelIndex,Doppler,PeekRssi,PreciseRssi,Phase,FirstReadTime,LastReadTime,ReadCount,Timestamp",
-        lambda r: (
-            f"{r['epc']},{r['antenna']},{r['channel']},{16 * r['doppler_hz']},{r['rssi_dbm']},{100 * r['rssi_dbm']},"
-            f"{r['code']},{r['time_us']},{r['time_us']},1,{r['time_us'] // 1000}"
-        ),
-    ),
-    "itemtest": (
-        "// Antennas connected = 1\n// Timestamp, EPC, TID, Antenna, RSSI, Frequency, Hostname, PhaseAngle, DopplerFrequency",
-        lambda r: (
-            f"{_iso(r['time_us'])}, {r['epc']}, , {r['antenna']}, {r['rssi_dbm']}, {_mhz(r)}, h, {_phase(r)!r}, "
-            f"{r['doppler_hz']}"
-        ),
-    ),
-    "itemtest_plain": (
-        "timestamp,epc,antenna,rssi,frequency,hostname,phaseAngle,dopplerFrequency,power",
-        lambda r: (
-            f"{_iso(r['time_us'])},{r['epc']},{r['antenna']},{r['rssi_dbm']},{_mhz(r)},h,{_phase(r)!r},"
-            f"{r['doppler_hz']},30"
-        ),
-    ),
-    "antenna_rail": (
-        "epc,antennaIndex,frequency,phase,RSSI,dopplerShift,position",
-        lambda r: (
-            f"{r['epc']},{r['antenna']},{HOP_TABLE_HZ[r['channel'] - 1]!r},{_phase(r)!r},{r['rssi_dbm']},"
-            f"{r['doppler_hz']},0"
-        ),
-    ),
-    "r700": (None, _r700),
-}
-
-
-def _lines(name: str, reads) -> list[str]:
-    header, write = WRITERS[name]
-    return [*([] if header is None else header.split("\n")), *map(write, reads)]
 
 
 def _imported(folder: Path, lines: list[str]):
@@ -132,14 +50,14 @@ def _imported(folder: Path, lines: list[str]):
 
 
 def test_every_format_with_phases_has_a_writer():
-    assert set(WRITERS) == set(FORMATS) - {"sllurp_log"}  # which holds no phases, and is refused
+    assert set(WRITERS) == set(FORMATS)
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", WITH_PHASES)
 @same_folder
 @given(tables())
 def test_what_is_written_in_a_format_is_read_back(tmp_path, name, written):
-    lines = _lines(name, written)
+    lines = sound_lines(name, written)
     recognised = recognise(lines)
     assert recognised is not None
     assert recognised.name == name
@@ -147,26 +65,26 @@ def test_what_is_written_in_a_format_is_read_back(tmp_path, name, written):
     assert report.format == name
     assert report.rejected == {}
     if name == "antenna_rail":  # without times: every tag's reads are stamped in order
-        written = sorted(written, key=lambda read: [r for r in written if r["epc"] == read["epc"]].index(read))
-        by_tag = {epc: [read for read in written if read["epc"] == epc] for epc in reads.epcs}
+        written = sorted(written, key=lambda read: [r for r in written if r.epc == read.epc].index(read))
+        by_tag = {epc: [read for read in written if read.epc == epc] for epc in reads.epcs}
         reads = {epc: reads.select(epc) for epc in reads.epcs}
         pairs = [(by_tag[epc], reads[epc]) for epc in by_tag]
     else:
-        expected_ns = np.array([read["time_us"] for read in written], np.int64) * 1000
+        expected_ns = np.array([read.time_us for read in written], np.int64) * 1000
         # Of seconds with a decimal fraction, a float's rounding remains: below a microsecond.
         np.testing.assert_allclose(reads.time_ns - expected_ns, 0, atol=1000)
         pairs = [(written, reads)]
     for rows, found in pairs:
         assert found.num_reads == len(rows)
-        assert found.epc.tolist() == [read["epc"] for read in rows]
-        carriers = [HOP_TABLE_HZ[read["channel"] - 1] for read in rows]
+        assert found.epc.tolist() == [read.epc for read in rows]
+        carriers = [HOP_TABLE_HZ[read.channel - 1] for read in rows]
         np.testing.assert_allclose(found.carrier_hz, carriers, rtol=1e-9)
-        np.testing.assert_allclose(found.phase_rad, [_phase(read) for read in rows], atol=1e-9)
-        np.testing.assert_allclose(found.rssi_dbm, [read["rssi_dbm"] for read in rows])
+        np.testing.assert_allclose(found.phase_rad, [read.phase_rad for read in rows], atol=1e-9)
+        np.testing.assert_allclose(found.rssi_dbm, [read.rssi_dbm for read in rows])
         if name != "octane":  # which has no column for them
-            np.testing.assert_array_equal(found.antenna, [read["antenna"] for read in rows])
+            np.testing.assert_array_equal(found.antenna, [read.antenna for read in rows])
         if name not in ("octane", "r700"):
-            np.testing.assert_allclose(found.doppler_hz, [read["doppler_hz"] for read in rows])
+            np.testing.assert_allclose(found.doppler_hz, [read.doppler_hz for read in rows])
         found.check()
 
 
@@ -174,12 +92,12 @@ def test_what_is_written_in_a_format_is_read_back(tmp_path, name, written):
 GARBAGE = st.text(st.characters(codec="utf-8", exclude_characters='"\r\n', exclude_categories=["Zl", "Zp", "Cc"]))
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", WITH_PHASES)
 @same_folder
 @given(tables(min_size=4), st.lists(GARBAGE, min_size=1, max_size=3))
 def test_rows_of_garbage_are_counted_and_leave_the_others_as_they_are(tmp_path, name, written, garbage):
     garbage = [line for line in garbage if line.strip() and not line.lstrip().startswith("//")]
-    lines = _lines(name, written)
+    lines = sound_lines(name, written)
     clean, _, _ = _imported(tmp_path, lines)
     reads, _, report = _imported(tmp_path, [*lines[:-1], *garbage, lines[-1]])
     assert reads.num_reads == len(written)
@@ -192,8 +110,9 @@ def test_rows_of_garbage_are_counted_and_leave_the_others_as_they_are(tmp_path, 
 @st.composite
 def spoiled(draw):
     """A table with one field of one row replaced by anything, and the number of that row."""
-    name = draw(st.sampled_from([name for name in WRITERS if name != "r700"]))
-    lines = _lines(name, draw(tables(min_size=4)))
+    name = draw(st.sampled_from([name for name in WITH_PHASES if name != "r700"]))
+    header, write = WRITERS[name]
+    lines = [*header.split("\n"), *map(write, draw(tables(min_size=4)))]
     number = draw(st.integers(len(lines) - 4, len(lines) - 1))
     fields = lines[number].split(",")
     field = draw(st.integers(0, len(fields) - 1))

@@ -131,7 +131,7 @@ def test_track_tables_are_checked(tmp_path):
     with pytest.raises(RecordingError, match="frames 1 to 4"):
         load_tracks_csv(path, np.arange(4) / 7)
     write([(1, 3, "x", 0, 1)])
-    with pytest.raises(RecordingError, match="line 2"):
+    with pytest.raises(RecordingError, match=r"1 of 1 rows rejected \(1: x_m is not a number \(line 2\)\)"):
         load_tracks_csv(path, np.arange(4) / 7)
     write([(1, 3)], header=("frame", "person"))
     with pytest.raises(RecordingError, match="x_m"):

@@ -9,7 +9,8 @@ import pytest
 
 from tagjax.recording import RecordingError, RecordingWarning
 from tagjax.recording.importers.clock import reader_epoch, to_host_clock
-from tagjax.recording.importers.formats import FORMATS, clean_epc, recognise, stamp_ns
+from tagjax.recording.importers.formats import FORMATS, recognise
+from tagjax.recording.importers.read_values import clean_epc, stamp_ns
 from tagjax.recording.importers.tables import import_table
 
 EPC = "E2801191A503006543210ABC"
@@ -136,8 +137,13 @@ def test_channel_indices_need_the_hop_table(tmp_path):
     with pytest.warns(RecordingWarning, match="hop table"):
         reads, _, _ = import_table(path)
     assert np.isnan(reads.carrier_hz).all()
-    with pytest.raises(RecordingError, match="entries 1 to 1"):
-        import_table(path, hop_table_hz=[920e6])
+    reads, _, report = import_table(path, hop_table_hz=[920e6])
+    assert reads.carrier_hz.tolist() == [920e6]
+    assert report.rejected_lines.texts() == [
+        "1: channel index is outside the hop table, which has entries 1 to 1 (line 2)"
+    ]
+    with pytest.raises(RecordingError, match=r"2 of 2 rows are not valid.*hop table"):
+        import_table(path, hop_table_hz=[])
 
 
 def test_reads_out_of_order_are_sorted_and_repeats_dropped(tmp_path):

@@ -300,6 +300,8 @@ def test_a_calibration_file_is_read_back_or_refused(tmp_path: Path) -> None:
         ("rotation", "eye"),
         ("intrinsics", [1, 2]),
         ("reprojection_px", "small"),
+        ("reprojection_px", 10**400),
+        ("fx_px", 10**400),
     ],
 )
 def test_a_damaged_calibration_file_is_refused_by_name(tmp_path: Path, name: str, value: object) -> None:

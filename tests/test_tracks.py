@@ -139,7 +139,7 @@ def test_what_is_no_folder_of_tracks_is_refused(folder, tmp_path):
     with pytest.raises(RecordingError, match="0 tracks"):
         load_scenes(TracksConfig(str(tmp_path)))
     (tmp_path / "kinect-rfid" / "1-1-2020.txt").write_text("7, yesterday, 1, 2\n")
-    with pytest.raises(RecordingError, match=r"line 1.*Expected id, time"):
+    with pytest.raises(RecordingError, match=r"time is not year-month-day .*\(line 1\)\); expected id, time"):
         load_scenes(TracksConfig(str(tmp_path)))
     (tmp_path / "t.csv").write_text(";time;id;x\n")
     with pytest.raises(RecordingError, match="columns y are missing"):
@@ -353,10 +353,11 @@ def test_a_uwb_tag_s_positions_become_speeds_towards_a_place(tmp_path):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("001E,1,2,3\n", r"line 1: not enough values.*Expected EPC"),
-        ("001E,1,2,fast,2020-05-01 12:00:00:000\n", "line 1: could not convert"),
-        ("001E,1,2,nan,2020-05-01 12:00:00:000\n", "line 1: the speed is nan"),
-        ("001E,1,2,0.3,noon\n", "line 1: time data"),
+        ("001E,1,2,3\n", r"1 of 1 rows rejected \(1: the number of values is not 5 \(line 1\)\); expected EPC"),
+        ("001E,1,2,fast,2020-05-01 12:00:00:000\n", "speed is not a number"),
+        ("001E,1,2,nan,2020-05-01 12:00:00:000\n", "speed is not finite"),
+        ("001E,1,2,101,2020-05-01 12:00:00:000\n", "speed is outside -100 to 100 m/s"),
+        ("001E,1,2,0.3,noon\n", "time is not year-month-day"),
     ],
 )
 def test_speeds_that_are_none_are_named(tmp_path, line, message):

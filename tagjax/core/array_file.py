@@ -1,6 +1,7 @@
 """PyTrees of arrays in safetensors files, with JSON metadata about the arrays and their origin.
 
-Nothing in a file is executed. Names, shapes and dtypes are compared with the expected tree before any value is read.
+Nothing in a file is executed. Names, shapes and dtypes are compared with the expected tree before any value is read. One
+checksum covers arrays and metadata.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import reprlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +22,7 @@ import safetensors
 import safetensors.numpy
 
 from .files import write_atomic
+from .json_text import json_checksum, parse_json
 
 _METADATA = "tagjax"
 """The one entry of the header's metadata, a JSON text. Of several entries safetensors does not keep the order, and the
@@ -53,8 +56,9 @@ class ArrayFile:
                 raise ValueError(
                     f"{path}: {name} is not finite (as {array.dtype}); expected finite values. Train again."
                 )
-        header = {**metadata, "format": self.format, "version": self.version, "sha256": _digest(arrays)}
-        text = json.dumps(header, indent=1, default=_plain)
+        header = {**metadata, "format": self.format, "version": self.version}
+        header = json.loads(json.dumps(header, default=_plain))
+        text = json.dumps({**header, "sha256": _digest(arrays, header)}, indent=1)
         write_atomic(path, safetensors.numpy.save(arrays, {_METADATA: text}))
 
     def metadata(self, path: Path) -> dict[str, Any]:
@@ -66,7 +70,7 @@ class ArrayFile:
         """A tree like `like`, with the arrays of a file in the dtypes of `like`, of which only shapes are used.
 
         Raises `ValueError` for a file that is missing, damaged or of another kind, and for one whose arrays have other
-        names, shapes or dtypes, or are not finite.
+        names, shapes or dtypes, are not finite (also in the dtypes of `like`) or do not have the checksum.
         """
         expected = named_arrays(like)
         with self._open(path) as file:
@@ -93,9 +97,15 @@ class ArrayFile:
                 raise ValueError(
                     f"{path}: {name} holds values that are not finite. Copy the file again, or train again."
                 )
-        if _digest(arrays) != metadata.get("sha256"):
-            raise ValueError(f"{path}: the arrays do not have the checksum of the header. Copy the file again.")
-        leaves = [jnp.asarray(arrays[name].astype(leaf.dtype)) for name, leaf in expected.items()]
+        if _digest(arrays, metadata) != metadata.get("sha256"):
+            raise ValueError(
+                f"{path}: arrays and metadata do not have the checksum of the header. Copy the file again."
+            )
+        with np.errstate(over="ignore"):
+            leaves = [jnp.asarray(arrays[name].astype(leaf.dtype)) for name, leaf in expected.items()]
+        for name, leaf in zip(expected, leaves, strict=True):
+            if not bool(jnp.all(jnp.isfinite(leaf))):
+                raise ValueError(f"{path}: {name} is not finite as {leaf.dtype}, this network's dtype. Train again.")
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
     @contextlib.contextmanager
@@ -117,14 +127,18 @@ class ArrayFile:
 
     def _metadata(self, file: Any, path: Path) -> dict[str, Any]:
         try:
-            metadata = json.loads((file.metadata() or {})[_METADATA])
-        except (KeyError, ValueError):
+            metadata = parse_json((file.metadata() or {})[_METADATA])
+        except KeyError:
             metadata = None
+        except ValueError as error:
+            raise ValueError(
+                f"{path}: the metadata of the header are no valid JSON ({error}). Copy the file again."
+            ) from error
         if not isinstance(metadata, dict) or metadata.get("format") != self.format:
             raise ValueError(f"{path}: a safetensors file, but no {self.content} (format {self.format}).")
         if metadata.get("version") != self.version:
             raise ValueError(
-                f"{path}: version {metadata.get('version')!r}; this release reads version {self.version}. Make the file "
+                f"{path}: version {reprlib.repr(metadata.get('version'))}; this release reads version {self.version}. Make the file "
                 f"again: `{self.made_by}`."
             )
         return metadata
@@ -136,9 +150,10 @@ def named_arrays(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of names and values: safetensors itself has no checksum."""
-    digest = hashlib.sha256()
+def _digest(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any]) -> str:
+    """SHA-256 of metadata, names and values: safetensors itself has no checksum."""
+    described = json_checksum({name: value for name, value in metadata.items() if name != "sha256"})
+    digest = hashlib.sha256(described.encode())
     for name in sorted(arrays):
         digest.update(name.encode() + np.ascontiguousarray(arrays[name]).tobytes())
     return digest.hexdigest()

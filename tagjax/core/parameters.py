@@ -6,26 +6,33 @@ fraction from 0 to 1; any other holds the value itself.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .numerics import logit
 
 _LOG, _LOGIT = "log_", "logit_"
+_MIN_FLOAT32, _MAX_FLOAT32 = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 ModuleT = TypeVar("ModuleT", bound=eqx.Module)
 
 
 def check_positive(**values: float) -> None:
-    """Raise `ValueError` with the name of a value that is not positive."""
+    """Raise `ValueError` with the name of a value that is not positive, or is 0 or infinite in float32."""
     for name, value in values.items():
         if not value > 0:
             raise ValueError(f"{name} is {value}; expected a positive value (it is stored as its logarithm).")
+        if not _MIN_FLOAT32 <= value <= _MAX_FLOAT32:
+            raise ValueError(
+                f"{name} is {reprlib.repr(value)}; expected {_MIN_FLOAT32:g} to {_MAX_FLOAT32:g}, as float32 has."
+            )
 
 
 def check_fractions(**values: float) -> None:
@@ -89,6 +96,8 @@ def with_physical(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
             check_fractions(**{name.removeprefix(_LOGIT): fraction})
             leaves[name] = logit_parameter(fraction)
         else:
+            if not -_MAX_FLOAT32 <= values[name] <= _MAX_FLOAT32:
+                raise ValueError(f"{name} is {reprlib.repr(values[name])}; expected a value that is finite in float32.")
             leaves[name] = jnp.asarray(values[name], jnp.float32)
     names = list(leaves)
     return eqx.tree_at(lambda m: [getattr(m, name) for name in names], module, [leaves[name] for name in names])

@@ -6,6 +6,7 @@ import dataclasses
 import multiprocessing
 import multiprocessing.connection
 import os
+import reprlib
 import signal
 import threading
 import time
@@ -18,6 +19,8 @@ from absl import flags
 
 _GRACE_PERIOD_S = 60.0
 """A worker that got SIGTERM goes on serving samples for so long."""
+
+_MAX_POSITION = 1 << 62
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +69,10 @@ class StreamIterator:
     def set_state(self, state: Any) -> None:
         """Continue at the position of `get_state`. Raises `ValueError` for anything else."""
         position = state.get("samples", state.get("next_index")) if isinstance(state, dict) else None
-        if not isinstance(position, int) or position < 0:
-            raise ValueError(f"The position in the data is {state!r}; expected {{'samples': <number drawn>}}.")
+        if not isinstance(position, int) or isinstance(position, bool) or not 0 <= position < _MAX_POSITION:
+            raise ValueError(
+                f"The position in the data is {reprlib.repr(state)}; expected {{'samples': <number drawn>}}."
+            )
         self.close()
         self._position = position
 

@@ -5,6 +5,7 @@ Nothing in a file is executed. The only class that its settings can name is a fl
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,7 +22,8 @@ PACKAGED = Path(__file__).parent / "weights"
 
 SUFFIX = ".safetensors"
 
-_FILE = ArrayFile("tagjax-flow-weights", 1, "weights of a flow network", "python -m experiments.train_flow")
+_FILE = ArrayFile("tagjax-flow-weights", 2, "weights of a flow network", "python -m experiments.train_flow")
+_MAX_SIZE, _MAX_LENGTH = 1024, 32  # of a number and of a list in the settings of a network
 
 Network = TypeVar("Network", bound=AbstractFlowNetwork)
 
@@ -119,7 +121,22 @@ def _abstract_network(settings: Mapping[str, Any], where: str) -> AbstractFlowNe
             f"{where}: the settings name {target!r}; expected a network of tagjax.flow ({', '.join(NETWORKS)})."
         )
     arguments = {str(key): value for key, value in settings.items() if key != "_target_"}
+    if too_large := [name for name, value in arguments.items() if name != "seed" and not _is_small(value)]:
+        raise ValueError(
+            f"{where}: {target} with {', '.join(too_large)} too large; expected at most {_MAX_SIZE}, and lists of at most "
+            f"{_MAX_LENGTH} values. Copy the file again, or train again."
+        )
     try:
         return eqx.filter_eval_shape(lambda: network(**arguments))
-    except (TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{where}: {target} does not take the settings {arguments}: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{where}: {target} does not take the settings {reprlib.repr(arguments)} ({type(error).__name__}: "
+            f"{str(error).partition(chr(10))[0]}). Copy the file again, or train again."
+        ) from error
+
+
+def _is_small(value: Any) -> bool:
+    """Whether the numbers and lists in a setting are of sizes that a network has, so that it can be built in seconds."""
+    if isinstance(value, list | tuple):
+        return len(value) <= _MAX_LENGTH and all(map(_is_small, value))
+    return not isinstance(value, int | float) or abs(value) <= _MAX_SIZE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from ..core.errors import RecordingError
 from ..core.numerics import SPEED_OF_LIGHT_M_S
 from ..radio.reader import (
     DOPPLER_STD_HZ,
@@ -24,11 +22,18 @@ from ..radio.reader import (
     read_times,
     rssi_at,
 )
+from .importers.read_values import integer, number
+from .importers.rows import Rejected, RowError, csv_header, csv_row, numbered, read_rows, text_lines
 from .reads import TagReads, join_reads
 from .recording import Recording, Truth
 
 MAX_GAP_FRAMES = 2
 """A gap of more frames than this splits a track into segments; there are no reads within the gap."""
+
+_POSITION = ("x_m", "y_m", "z_m")
+_TRACK_COLUMNS = ("frame", "person", *_POSITION)
+_MAX_LABEL = 254  # of a label image, in which 255 is for pixels to ignore
+_MAX_POSITION_M = 100.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,28 +72,35 @@ class Track:
 def load_tracks_csv(path: str | Path, frame_time_s: np.ndarray) -> dict[int, Track]:
     """Tracks by label from a CSV table frame,person,x_m,y_m,z_m,... with frames counted from 1.
 
-    Raises `RecordingError` for missing columns, values that are not numbers, and frames outside the recording.
+    Rows that are not valid are left out, with a `RecordingWarning`. Raises `RecordingError` for missing columns, and if most
+    rows are not valid.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise RecordingError(f"{path}: no such file; expected a table of tracks (frame,person,x_m,y_m,z_m).")
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.DictReader(file)
-        missing = {"frame", "person", "x_m", "y_m", "z_m"} - set(rows.fieldnames or ())
-        if missing:
-            raise RecordingError(f"{path}: columns {', '.join(sorted(missing))} are missing; found {rows.fieldnames}.")
-        positions: dict[int, np.ndarray] = {}
-        for line, row in enumerate(rows, start=2):
-            try:
-                frame, label = int(row["frame"]) - 1, int(row["person"])
-                position = [float(row[name]) for name in ("x_m", "y_m", "z_m")]
-            except (TypeError, ValueError) as error:
-                raise RecordingError(f"{path}, line {line}: {error}. Expected numbers.") from error
-            if not 0 <= frame < len(frame_time_s):
-                raise RecordingError(
-                    f"{path}, line {line}: frame {frame + 1}; the recording has frames 1 to {len(frame_time_s)}."
-                )
-            positions.setdefault(label, np.full((len(frame_time_s), 3), np.nan))[frame] = position
+    path, num_frames = Path(path), len(frame_time_s)
+    (_, header), *lines = numbered(text_lines(path))
+    columns, rejected = csv_header(path, header, _TRACK_COLUMNS), Rejected()
+    positions: dict[int, np.ndarray] = {}
+    found: set[tuple[int, int]] = set()
+
+    def parse(text: str) -> tuple[int, int, list[float]]:
+        row = csv_row(columns, text)
+        frame, label = integer(row, "frame"), integer(row, "person")
+        if not 1 <= frame <= num_frames:
+            raise RowError(f"frame is outside the recording, which has frames 1 to {num_frames}")
+        if not 1 <= label <= _MAX_LABEL:
+            raise RowError(f"person is outside 1 to {_MAX_LABEL}")
+        if (frame, label) in found:
+            raise RowError("this frame of the same person is there already")
+        found.add((frame, label))
+        if all(row[name].strip().lower() == "nan" for name in _POSITION):
+            return frame, label, [np.nan] * 3
+        position = [number(row, name) for name in _POSITION]
+        if max(map(abs, position)) > _MAX_POSITION_M:
+            raise RowError(f"position is more than {_MAX_POSITION_M:g} m away: wrong unit?")
+        return frame, label, position
+
+    for _, (frame, label, position) in read_rows(lines, parse, rejected):
+        positions.setdefault(label, np.full((num_frames, 3), np.nan))[frame - 1] = position
+    rejected.check(path, len(lines), "frame, person, x_m, y_m and z_m of the same recording")
     return {label: Track(np.asarray(frame_time_s, float), position) for label, position in sorted(positions.items())}
 
 

@@ -1,7 +1,7 @@
 """Learned tracer parameters as plain numbers: one JSON file with the tracer's settings, the clip settings and the recipe.
 
 Nothing in a file is executed: it names numbers, which take the place of parameters that the tracer has already, and the
-clip settings of the training, with which the tracer is evaluated unless others are given.
+clip settings of the training, with which the tracer is evaluated unless others are given. A checksum shows damage.
 """
 
 from __future__ import annotations
@@ -9,20 +9,22 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
-import math
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ..core.files import write_atomic
+from ..core.json_text import json_checksum, not_float32, parse_json
 from . import TagAttention
 
 PACKAGED = Path(__file__).parent / "weights"
 """Where the parameters that come with the package lie, as <name>.json."""
 
 _FORMAT = "tagjax-tracer-parameters"
-_VERSION = 2
-_LONGEST_TEXT = 1_000_000
+_VERSION = 3
+_MAX_BYTES = 1_000_000
+_CHECKSUM = "sha256"
 
 CLIP_NAMES = ("stride", "window", "flow", "estimator", "antennas")
 """Clip settings that change a tracer's results; `max_reads` and `length` are sizes of buffers."""
@@ -60,7 +62,7 @@ def save_parameters(
 
     `settings` are those that the tracer was built with, as under conf/tracer. `clips` are the clip settings of its training
     that change its results (`CLIP_NAMES`); a flow in a file beside `path` is named relative to it. `about` is for people:
-    recipe, seed, data, scores.
+    recipe, seed, data, scores. Raises `ValueError` for values that are not finite in float32.
     """
     path = Path(path)
     chosen = {name: clips[name] for name in CLIP_NAMES if name in clips}
@@ -74,7 +76,27 @@ def save_parameters(
         "parameters": tracer.physical(),
         "about": dict(about or {}),
     }
-    write_atomic(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    _write(path, content)
+
+
+def renew_checksum(path: str | Path) -> None:
+    """Write the checksum of a file of learned parameters again, after it was edited on purpose.
+
+    Raises `ValueError` for a file of another kind, and for values that are not finite in float32.
+    """
+    path = Path(path)
+    _write(path, _content(path))
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    content = {name: value for name, value in content.items() if name != _CHECKSUM}
+    if wrong := not_float32(content):
+        raise ValueError(
+            f"{path}: {', '.join(wrong[:5])}: not finite in float32; expected finite numbers. Train again."
+        )
+    # The checksum is that of the text, in which tuples are lists.
+    checksum = json_checksum(json.loads(json.dumps(content)))
+    write_atomic(path, json.dumps({**content, _CHECKSUM: checksum}, indent=1, allow_nan=False) + "\n")
 
 
 def read_learned(source: str | Path, settings: Mapping[str, Any] | None = None) -> Learned:
@@ -152,27 +174,59 @@ def _default_for(settings: Mapping[str, Any] | None) -> Learned:
 
 
 def _read(path: Path) -> Learned:
-    try:
-        if path.stat().st_size > _LONGEST_TEXT:
-            raise ValueError(f"{path.stat().st_size} bytes")
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: no learned parameters ({type(error).__name__}: {error}).") from error
-    if not isinstance(content, dict) or content.get("format") != _FORMAT:
-        raise ValueError(f"{path}: found JSON, but no learned parameters; expected the format {_FORMAT}.")
-    if content.get("version") != _VERSION:
-        raise ValueError(f"{path}: version {content.get('version')!r}; this release reads {_VERSION}. Train again.")
+    content = _content(path)
     parts = [content.get(name) for name in ("settings", "clips", "parameters")]
     if not all(isinstance(part, dict) for part in parts):
         raise ValueError(f"{path}: no settings, clips or parameters found; expected all three. Copy the file again.")
     wrong = [name for name, value in content["parameters"].items() if not _is_number(value)]
     if wrong:
-        raise ValueError(f"{path}: {', '.join(wrong)}: not a finite number. Train again.")
+        raise ValueError(f"{path}: {', '.join(wrong)}: not a number; expected one. Train again.")
+    checked = {name: value for name, value in content.items() if name != _CHECKSUM}
+    if wrong := not_float32(checked):
+        raise ValueError(
+            f"{path}: {', '.join(wrong[:5])}: not finite in float32; expected finite numbers. Train again."
+        )
+    default = content.get("default", True)
+    if not isinstance(default, bool):
+        raise ValueError(f"{path}: found default={default!r}; expected true or false. Copy the file again.")
+    if content.get(_CHECKSUM) != json_checksum(checked):
+        raise ValueError(
+            f"{path}: the content does not have the checksum of the file: it is damaged or was edited. Copy it again; after an "
+            "edit on purpose call tagjax.tagattention.learned.renew_checksum."
+        )
     clips = dict(content["clips"])
-    if isinstance(flow := clips.get("flow"), str) and (path.parent / flow).is_file():
+    if isinstance(flow := clips.get("flow"), str) and _is_file(path.parent / flow):
         clips["flow"] = str(path.parent / flow)
-    return Learned(path, content["settings"], clips, content["parameters"], content.get("default", True))
+    parameters = {name: float(value) for name, value in content["parameters"].items()}
+    return Learned(path, content["settings"], clips, parameters, default)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """The JSON of a file of learned parameters of this version. Raises `ValueError` for any other file."""
+    try:
+        if (size := path.stat().st_size) > _MAX_BYTES:
+            raise ValueError(f"found {size} bytes; expected at most {_MAX_BYTES}")
+        content = parse_json(path.read_bytes().decode("utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"{path}: no learned parameters ({type(error).__name__}: {error}); expected JSON of `python -m experiments.train`. "
+            "Copy the file again."
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ValueError(f"{path}: found JSON, but no learned parameters; expected the format {_FORMAT}.")
+    if content.get("version") != _VERSION:
+        raise ValueError(
+            f"{path}: version {reprlib.repr(content.get('version'))}; this release reads {_VERSION}. Train again."
+        )
+    return content
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False

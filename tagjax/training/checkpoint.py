@@ -1,13 +1,14 @@
 """Checkpoints: everything that a run needs to resume exactly where it stopped, written atomically by Orbax.
 
 A checkpoint holds the arrays of the training state (never code or pickles), the state of the data iterator and a
-description of the arrays, which is compared before anything is restored. With several processes
+description of the arrays, which is compared before anything is restored. The description has a checksum. With several processes
 only process 0 reads and writes the folder, so no shared file system is needed.
 """
 
 from __future__ import annotations
 
 import json
+import reprlib
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -18,12 +19,13 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
+from ..core.json_text import json_checksum
 from .processes import broadcast_arrays, broadcast_json, is_first
 from .state import HasStep
 
 StateT = TypeVar("StateT", bound=HasStep)
 
-FORMAT = "tagjax training checkpoint 1"
+FORMAT = "tagjax training checkpoint 2"
 
 
 class CheckpointError(ValueError):
@@ -87,6 +89,7 @@ class Checkpoints:
         # A flat dictionary keyed by number: Orbax needs no knowledge of the classes, and nothing is pickled.
         arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
         about = {"format": FORMAT, "step": step, "arrays": describe_arrays(state), "data": _jsonable(data_state)}
+        about["sha256"] = json_checksum(about)
         self._manager.save(
             step,
             args=ocp.args.Composite(
@@ -150,9 +153,31 @@ class Checkpoints:
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             found = about.get("format") if isinstance(about, dict) else type(about).__name__
             raise CheckpointError(
-                f"{path} has format {found!r}; expected {FORMAT!r}. Another program or version wrote it."
+                f"{path} has format {reprlib.repr(found)}; expected {FORMAT!r}. Another program or version wrote it."
             )
+        _check_about(about, path, step)
         return about
+
+
+def _check_about(about: dict[str, Any], path: Path, step: int) -> None:
+    """Raise `CheckpointError` unless a description has the checksum, the step and the entries that it was written with."""
+    try:
+        checksum = json_checksum({name: value for name, value in about.items() if name != "sha256"})
+    except (RecursionError, ValueError):
+        checksum = None
+    arrays = about.get("arrays")
+    described = isinstance(arrays, dict) and all(isinstance(text, str) for text in arrays.values())
+    if checksum is None or about.get("sha256") != checksum:
+        fault = "does not have its checksum"
+    elif about.get("step") != step or isinstance(about["step"], bool | float):
+        fault = f"is of step {reprlib.repr(about.get('step'))}; expected {step}"
+    elif not described or "data" not in about:
+        fault = "lacks arrays (names and shapes) or data (the position in the data)"
+    else:
+        return
+    raise CheckpointError(
+        f"{path} is damaged: its description {fault}. Delete that folder to go on from an older checkpoint."
+    )
 
 
 def _compare(found: dict[str, str], expected: dict[str, str], path: Path) -> None:

@@ -96,7 +96,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 def resume_state(state: StateT, samples: DataIterator, checkpoints: Checkpoints, *, allowed: bool) -> StateT:
     """The newest checkpoint's state, with `samples` moved to its position; `state` itself where there is no checkpoint.
 
-    Raises `CheckpointError` if there is one and resuming is not `allowed`.
+    Raises `CheckpointError` if there is one and resuming is not `allowed`, and for one with another position in the data.
     """
     if not checkpoints.steps():
         return state
@@ -105,7 +105,12 @@ def resume_state(state: StateT, samples: DataIterator, checkpoints: Checkpoints,
             f"{checkpoints.folder.parent} already holds a run; set resume=true or choose another folder."
         )
     state, data_state = checkpoints.restore(state)
-    samples.set_state(data_state)
+    try:
+        samples.set_state(data_state)
+    except ValueError as error:
+        raise CheckpointError(
+            f"{checkpoints.folder / str(int(state.step))}: {error} Resume with this run's data."
+        ) from error
     return state
 
 

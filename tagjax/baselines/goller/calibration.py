@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...core.files import write_atomic
+from ...core.json_text import parse_json
 from ...core.results import finite_array
 from ...recording import Recording
 from .antennas import FLOOR_DBM, AntennaModel, fit_antennas
@@ -68,7 +69,7 @@ def load_calibration(path: str | Path) -> Calibration:
     calibration.
     """
     try:
-        found = json.loads(Path(path).read_text())
+        found = parse_json(Path(path).read_bytes())
         skew_m = found[".location.antennas.skew_m"]
         if not isinstance(skew_m, list) or not skew_m:
             raise ValueError(f"skew_m is {skew_m!r:.40}; expected a number for each antenna")

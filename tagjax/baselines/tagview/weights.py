@@ -19,7 +19,7 @@ PACKAGED = Path(__file__).parent / "detector.safetensors"
 """The weights that come with the package."""
 
 _FILE = ArrayFile(
-    "tagjax-tagview-detector", 2, "weights of a Tagview detector", "python -m experiments.tagview command=train"
+    "tagjax-tagview-detector", 3, "weights of a Tagview detector", "python -m experiments.tagview command=train"
 )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from ...core.files import write_atomic
+from ...core.json_text import parse_json
 from ...core.results import finite_array
 from ...recording import Intrinsics
 
@@ -114,7 +115,7 @@ def save_calibration(camera: PlaneCamera | Intrinsics, path: str | Path, **about
 def load_calibration(path: str | Path) -> PlaneCamera:
     """Read a calibration with a pose. Raises `ValueError` for any other file."""
     try:
-        values = json.loads(Path(path).read_text())
+        values = parse_json(Path(path).read_bytes())
     except (OSError, ValueError) as error:
         raise ValueError(
             f"{path}: no readable calibration ({error}). Make one with experiments.calibrate_camera."
@@ -137,5 +138,5 @@ def load_calibration(path: str | Path) -> PlaneCamera:
             finite_array(values["translation_m"], (3,), "translation_m"),
             float("nan") if error_px is None else float(error_px),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: damaged calibration ({type(error).__name__}: {error}). Make it again.") from error

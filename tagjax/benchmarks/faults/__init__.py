@@ -1,1 +1,1 @@
-"""Trials of faults: bad input and interruptions, tried and failed by kind."""
+"""Trials of faults: damaged and hostile inputs, each of which must end in a sound result or in one clear line."""

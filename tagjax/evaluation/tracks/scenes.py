@@ -68,7 +68,7 @@ def _scene(name: str, tracks: Sequence[tuple[np.ndarray, np.ndarray]], rate_hz: 
 def load_kinect(folder: Path, rate_hz: float) -> Scene:
     """All skeleton tracks of a folder (id, time, x cm, z cm), recorded one or two at a time, on a common clock.
 
-    Raises `RecordingError` for lines of another format and for fewer than two tracks.
+    Raises `RecordingError` for files of another format and for fewer than two tracks.
     """
     tracks = []
     for path in sorted(folder.glob("[0-9]*.txt")):

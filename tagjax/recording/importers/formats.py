@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import base64
 import binascii
-import csv
 import dataclasses
+import itertools
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from .read_values import (
     Read,
-    Row,
-    RowError,
     clean_epc,
     codes_rad,
     degrees_rad,
@@ -22,6 +20,7 @@ from .read_values import (
     radians_rad,
     stamp_ns,
 )
+from .rows import Row, RowError, csv_fields, csv_row
 
 
 def _sllurp(row: Row) -> Read:
@@ -109,9 +108,9 @@ def _rail(row: Row) -> Read:
 def _r700(row: Row) -> Read:
     try:
         event = json.loads(row["line"])
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise RowError("line is not JSON") from error
-    if not isinstance(event, dict) or "tagInventoryEvent" not in event:
+    if not isinstance(event, dict) or not isinstance(event.get("tagInventoryEvent"), dict):
         raise RowError("event is not a tag inventory")
     tag = {name: str(value) for name, value in event["tagInventoryEvent"].items()}
     epc = tag.get("epcHex")
@@ -134,31 +133,49 @@ def _r700(row: Row) -> Read:
     )
 
 
-def _plain(lines: Sequence[str]) -> Iterator[Row]:
-    yield from csv.DictReader(lines, skipinitialspace=True)
-
-
-def _commented(lines: Sequence[str]) -> Iterator[Row]:
-    """The last comment line is the header."""
-    comments = [line for line in lines if line.lstrip().startswith("//")]
-    body = [line for line in lines if line.strip() and not line.lstrip().startswith("//")]
-    yield from csv.DictReader([comments[-1].lstrip().removeprefix("//").strip(), *body], skipinitialspace=True)
-
-
-def _line_by_line(lines: Sequence[str]) -> Iterator[Row]:
-    for line in lines:
-        if line.strip():
-            yield {"line": line}
-
-
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """A table format: the columns that identify it, how lines become rows, how a row becomes a read."""
+    """A table format: the columns that identify it, how a row becomes a read, and where the header is.
+
+    `layout` is "csv" (the first line is the header), "commented_csv" (of the first lines, which begin with //, the last is
+    the header) or "json_lines" (each line is an event; there is no header).
+    """
 
     name: str
     columns: frozenset[str]
     read: Callable[[Row], Read]
-    rows: Callable[[Sequence[str]], Iterable[Row]] = _plain
+    layout: str = "csv"
+
+    def row_parser(self, lines: Sequence[tuple[int, str]]) -> tuple[Callable[[str], Row], Sequence[tuple[int, str]]]:
+        """The function that splits a line into values by column, and the lines of the rows, numbered as `lines` are.
+
+        Raises `RowError` if the header is missing, is not CSV or has a column twice; the function raises it for a line.
+        """
+        if self.layout == "json_lines":
+            return lambda line: {"line": line}, lines
+        comments = _first_comments([line for _, line in lines]) if self.layout == "commented_csv" else []
+        if self.layout == "commented_csv" and not comments:
+            raise RowError("the header is missing: expected a line that begins with //")
+        header = comments[-1].lstrip().removeprefix("//").strip() if comments else lines[0][1]
+        columns = _column_names(header)
+        names = [name.lower() if self.read is _itemtest else name for name in columns]
+        if repeated := sorted(name for name in self.columns if names.count(name) > 1):
+            raise RowError(f"column {repeated[0]} is there twice; expected it once")
+        body = [one for one in lines if not _is_comment(one[1])] if comments else lines[1:]
+        return lambda line: csv_row(columns, line), body
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("//")
+
+
+def _column_names(header: str) -> list[str]:
+    return [name.strip().strip('"') for name in csv_fields(header)]
+
+
+def _first_comments(lines: Sequence[str]) -> list[str]:
+    """The comments above the first row. Of later ones none is a header: a damaged row may begin like a comment."""
+    return list(itertools.takewhile(_is_comment, lines))
 
 
 FORMATS: dict[str, Format] = {
@@ -169,9 +186,9 @@ FORMATS: dict[str, Format] = {
         Format("octane_gesture", frozenset({"EPC", "Time", "Frequency(MHz)", "PhaseAngle(Radian)"}), _octane_gesture),
         Format("tagbeat", frozenset({"EPC", "AntnenaId", "PreciseRssi", "FirstReadTime", "Phase"}), _tagbeat),
         Format("antenna_rail", frozenset({"epc", "antennaIndex", "frequency", "phase", "position"}), _rail),
-        Format("itemtest", frozenset({"timestamp", "epc", "frequency", "phaseangle"}), _itemtest, _commented),
+        Format("itemtest", frozenset({"timestamp", "epc", "frequency", "phaseangle"}), _itemtest, "commented_csv"),
         Format("itemtest_plain", frozenset({"timestamp", "epc", "frequency", "phaseangle"}), _itemtest),
-        Format("r700", frozenset({"tagInventoryEvent"}), _r700, _line_by_line),
+        Format("r700", frozenset({"tagInventoryEvent"}), _r700, "json_lines"),
         Format("sllurp_log", frozenset({"timestamp", "reader", "antenna", "rssi", "epc"}), _sllurp_log),
     )
 }
@@ -182,15 +199,16 @@ def recognise(lines: Sequence[str]) -> Format | None:
     head = [line.strip() for line in lines[:20] if line.strip()]
     if not head:
         return None
-    if head[0].startswith("{"):
-        return FORMATS["r700"] if any("EventType" in line or "eventType" in line for line in head) else None
-    comments = [line for line in head if line.startswith("//")]
-    header = comments[-1].removeprefix("//") if comments else head[0]
-    columns = {name.strip().strip('"') for name in next(csv.reader([header], skipinitialspace=True))}
+    if any(line.startswith("{") and ("EventType" in line or "eventType" in line) for line in head):
+        return FORMATS["r700"]
+    comments = _first_comments(head)
+    try:
+        columns = set(_column_names(comments[-1].removeprefix("//") if comments else head[0]))
+    except RowError:
+        return None
     low = {name.lower() for name in columns}
     for one in FORMATS.values():
-        if one.rows is _line_by_line or (one.rows is _commented) != bool(comments):
-            continue
-        if one.columns <= (low if one.read is _itemtest else columns):
+        fits = one.columns <= (low if one.read is _itemtest else columns)
+        if fits and one.layout == ("commented_csv" if comments else "csv"):
             return one
     return None

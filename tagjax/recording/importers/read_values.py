@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import datetime as dt
 import math
 import re
-from collections.abc import Mapping
+
+from .rows import Row, RowError
 
 _TURN_RAD = 2 * math.pi
 _CODES_PER_TURN = 4096
+_MAX_EPC_DIGITS = 124  # 496 bits, the most that EPC Gen2 has
 
 
 @dataclasses.dataclass
@@ -28,18 +29,11 @@ class Read:
     doppler_hz: float | None = None
 
 
-class RowError(ValueError):
-    """A row that is not a valid read; the import report counts rows by this message."""
-
-
-Row = Mapping[str, str]
-
-
 def number(row: Row, name: str) -> float:
-    """A finite number of a column. Raises `RowError`."""
+    """A finite number of a column, in ASCII digits. Raises `RowError`, and `KeyError` without the column."""
     try:
-        value = float(row[name])
-    except (KeyError, TypeError, ValueError) as error:
+        value = float(_plain_digits(row[name]))
+    except (AttributeError, TypeError, ValueError) as error:
         raise RowError(f"{name} is not a number") from error
     if not math.isfinite(value):
         raise RowError(f"{name} is not finite")
@@ -47,32 +41,38 @@ def number(row: Row, name: str) -> float:
 
 
 def integer(row: Row, name: str) -> int:
-    """An integer of a column. Raises `RowError`."""
+    """An integer of a column, in ASCII digits. Raises `RowError`, and `KeyError` without the column."""
     try:
-        return int(row[name])
-    except (KeyError, TypeError, ValueError) as error:
+        return int(_plain_digits(row[name]))
+    except (AttributeError, TypeError, ValueError) as error:
         raise RowError(f"{name} is not an integer") from error
 
 
+def _plain_digits(text: str) -> str:
+    """The text. Raises `ValueError` for digits of other scripts and for 1_000, which Python takes for numbers."""
+    if not text.isascii() or "_" in text:
+        raise ValueError("expected ASCII digits")
+    return text
+
+
 def clean_epc(text: str | None) -> str:
-    """An EPC in upper-case hex, without spaces, hyphens and the b'...' of printed Python bytes."""
+    """An EPC in upper-case hex, without spaces, hyphens and the b'...' of printed Python bytes. Raises `RowError`."""
     cleaned = (text or "").strip()
-    if re.fullmatch(r"b(['\"]).*\1", cleaned):
-        try:
-            cleaned = ast.literal_eval(cleaned).decode("ascii", "replace")
-        except (SyntaxError, ValueError) as error:
-            raise RowError("EPC is not hexadecimal") from error
-    cleaned = re.sub(r"[\s-]", "", cleaned).upper()
-    if not re.fullmatch(r"[0-9A-F]{4,}", cleaned):
+    if printed := re.fullmatch(r"b(['\"])(.*)\1", cleaned):
+        cleaned = printed[2]
+    cleaned = re.sub(r"[\s-]", "", cleaned)
+    if not re.fullmatch(r"[0-9A-Fa-f]{4,}", cleaned):
         raise RowError("EPC is not hexadecimal")
-    return cleaned
+    if len(cleaned) > _MAX_EPC_DIGITS:
+        raise RowError(f"EPC has more than {_MAX_EPC_DIGITS} digits")
+    return cleaned.upper()
 
 
 def stamp_ns(text: str | None) -> int:
     """Nanoseconds since 1970 of an ISO time, or of a number of seconds, milliseconds, microseconds or nanoseconds."""
     text = (text or "").strip()
     try:
-        value = float(text)
+        value = float(_plain_digits(text))
     except ValueError:
         try:
             moment = dt.datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", text.replace("Z", "+00:00")))

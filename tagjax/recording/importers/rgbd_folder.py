@@ -18,6 +18,8 @@ from ...core.names import valid_name
 from ..image_files import natural_sorted, read_colour, read_image, read_labels
 from ..reads import TagReads
 from ..recording import Recording, Truth
+from .read_values import number
+from .rows import Rejected, RowError, numbered, read_rows, text_lines
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +114,10 @@ def load_calibration(path: str | Path, shape: tuple[int, int]) -> DepthToColour:
         raise RecordingError(
             f"{path}: cam_params is incomplete ({error}); expected Kdepth, Krgb and R, 3 x 3, and T, 3 numbers."
         ) from error
+    if not all(np.isfinite(value).all() for value in (depth, colour, rotation, translation)):
+        raise RecordingError(
+            f"{path}: cam_params holds values that are not finite; expected a calibration. Copy it again."
+        )
     if np.linalg.norm(translation) > 1.0:
         translation = translation / 1000.0
     height, width = shape
@@ -195,14 +201,17 @@ TUM_SHAPE = (480, 640)
 
 TUM_UNITS_PER_M = 5000.0
 
+_MAX_TIME_S = 9e9  # of int64 nanoseconds
+
 
 def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: float = 0.02) -> Recording:
     """A TUM RGB-D folder (rgb.txt, depth.txt; depth PNG in 1/5000 m, registered): each image with the depth nearest in
     time.
 
     The camera follows from the folder's name if not given; lens distortion is removed frame by frame. Images without
-    depth within `max_gap_s` are left out; the recording's `source` states how many. Raises `RecordingError` for missing
-    or malformed files and an unknown camera.
+    depth within `max_gap_s` are left out; the recording's `source` states how many. Rows of a list that are not valid are
+    left out, with a `RecordingWarning`. Raises `RecordingError` for missing lists, lists of which most rows are not valid,
+    and an unknown camera.
     """
     folder = Path(folder)
     listings = {kind: _tum_listing(folder / f"{kind}.txt") for kind in ("rgb", "depth")}
@@ -224,9 +233,6 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
         raise RecordingError(
             f"{folder}: no image has a depth map within {max_gap_s} s; expected both lists on the same clock."
         )
-    absent = [path for _, *both in pairs for path in both if not path.is_file()]
-    if absent:
-        raise RecordingError(f"{folder}: {len(absent)} listed files are missing, first {absent[0]}. Copy them again.")
     shape = read_colour(pairs[0][1]).shape
     if shape[:2] != TUM_SHAPE:
         raise RecordingError(
@@ -265,18 +271,35 @@ def import_tum(folder: str | Path, *, camera: str | None = None, max_gap_s: floa
 
 
 def _tum_listing(path: Path) -> list[tuple[float, Path]]:
+    """The times and files that a list of a TUM folder names, without the rows that are not valid."""
     if not path.is_file():
         raise RecordingError(f"{path}: missing; a TUM RGB-D folder lists its images there.")
-    rows = []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            stamp, name = float(fields[0]), fields[1]
-        except (ValueError, IndexError) as error:
-            raise RecordingError(f"{path}, line {number}: {line!r}; expected a time and a file name.") from error
-        rows.append((stamp, path.parent / name))
-    if not rows:
-        raise RecordingError(f"{path}: lists no image.")
+    stamps: set[float] = set()
+
+    def parse(text: str) -> tuple[float, Path]:
+        stamp, *names = text.split()
+        stamp_s = number({"time": stamp}, "time")
+        if not 0 <= stamp_s <= _MAX_TIME_S:
+            raise RowError(f"time is outside 0 to {_MAX_TIME_S:g} s")
+        if stamp_s in stamps:
+            raise RowError("this time is there already")
+        name = Path(*names[:1])
+        if name.is_absolute() or ".." in name.parts:
+            raise RowError("the file is outside of the folder")
+        if not _is_file(path.parent / name):
+            raise RowError("the file is missing")
+        stamps.add(stamp_s)
+        return stamp_s, path.parent / name
+
+    lines = [one for one in numbered(text_lines(path)) if not one[1].lstrip().startswith("#")]
+    rejected = Rejected()
+    rows = [row for _, row in read_rows(lines, parse, rejected)]
+    rejected.check(path, len(lines), "a time in seconds and the name of an image, separated by a space")
     return rows
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False

@@ -15,30 +15,37 @@ import numpy as np
 from ...core.errors import RecordingError, RecordingWarning
 from ..reads import TagReads
 from ..recording import ClockAudit
-from .clock import HostTimes, reader_epoch, to_host_clock
-from .formats import FORMATS, Format, Read, RowError, recognise
-
-MAX_REJECTED = 0.5
-"""A table of which a larger fraction of rows is rejected is taken for another format."""
+from .clock import MAX_SET_ASIDE, HostTimes, reader_epoch, to_host_clock
+from .formats import FORMATS, Format, recognise
+from .read_values import Read
+from .rows import MAX_REJECTED, Rejected, RowError, numbered, read_rows, shortened, text_lines
 
 _MAX_NUMBER = np.iinfo(np.int16).max
 _MAX_TIME_NS = np.iinfo(np.int64).max
+_MAX_DOPPLER_HZ = 1e5
+_MAX_CARRIER_DIFFERENCE_HZ = 60e6
+"""A row whose carrier differs by more from the table's median is rejected; one reader's band spans at most about 100 MHz."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """Result of an import: numbers of rows and reads, rejected rows by reason, and notes about corrections."""
+    """Result of an import: numbers of rows and reads, line numbers of rejected rows by reason, and notes about corrections."""
 
     format: str
     num_rows: int
     num_reads: int
-    rejected: dict[str, int]
+    rejected_lines: Rejected
     notes: tuple[str, ...]
 
+    @property
+    def rejected(self) -> dict[str, int]:
+        """The number of rejected rows by reason."""
+        return {reason: len(lines) for reason, lines in self.rejected_lines.lines_by_reason.items()}
+
     def lines(self) -> list[str]:
-        """The report as lines of text."""
+        """The report as lines of text; of the rejected rows of each reason the first line numbers are given."""
         out = [f"format {self.format}: {self.num_reads} reads of {self.num_rows} rows"]
-        out += [f"rejected {count}: {reason}" for reason, count in sorted(self.rejected.items())]
+        out += [f"rejected {text}" for text in self.rejected_lines.texts()]
         return out + list(self.notes)
 
 
@@ -63,35 +70,18 @@ def import_table(
             reader time fits no clock are then rejected.
         synthetic_rate_hz: rows of a table without times get times in order, each tag at this rate.
 
-    Raises `RecordingError` if no format fits, phases are absent, or more than half of the rows are rejected.
+    A row that is not a valid read is rejected, counted and reported with its line number. Raises `RecordingError` for a
+    file that is no text, if no format fits, if phases are absent, or if more than half of the rows are rejected.
     """
     path = Path(path)
-    if not path.is_file():
-        raise RecordingError(f"{path}: no such file.")
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    lines = text_lines(path)
     chosen = _choose(path, lines, format)
     if chosen.name == "sllurp_log":
         raise RecordingError(
             f"{path}: a sllurp log without phases; expected phase reports. Enable them (impinj_tag_content_selector: "
             "EnableRFPhaseAngle) and record again."
         )
-    rejected: collections.Counter[str] = collections.Counter()
-    reads: list[Read] = []
-    num_rows = 0
-    for row in chosen.rows(lines):
-        num_rows += 1
-        try:
-            reads.append(_checked(chosen.read(row)))
-        except RowError as error:
-            rejected[str(error)] += 1
-        except (KeyError, TypeError, AttributeError):
-            rejected["columns are missing"] += 1
-    if num_rows == 0 or len(reads) < (1 - MAX_REJECTED) * num_rows:
-        reasons = "; ".join(f"{count} times: {reason}" for reason, count in rejected.most_common(3)) or "no row"
-        raise RecordingError(
-            f"{path}: {num_rows - len(reads)} of {num_rows} rows are not valid {chosen.name} reads ({reasons}). Check format and "
-            "units; set format= to one of " + ", ".join(FORMATS) + "."
-        )
+    reads, line_of_read, num_rows, rejected = _reads(path, lines, chosen, hop_table_hz)
     notes: list[str] = []
     times = _times(reads, clock, synthetic_rate_hz, notes)
     carrier, index = _carriers(reads, hop_table_hz, carrier_hz, notes)
@@ -109,13 +99,14 @@ def import_table(
         hop_table_hz=tuple(hop_table_hz or ()),
     )
     if not times.usable.all():
-        rejected["the reader's time fits no clock"] = int(np.sum(~times.usable))
-        table = table[times.usable]
+        wrong = line_of_read[~times.usable]
+        rejected.lines_by_reason["the reader's time fits no clock"] = sorted(wrong.tolist())
+        table, line_of_read = table[times.usable], line_of_read[times.usable]
     order = np.argsort(table.time_ns, kind="stable")
     back = int(np.sum(np.diff(table.time_ns) < 0))
     if back:
         notes.append(f"{back} reads were out of order of time and have been sorted")
-    table = table[order]
+    table, line_of_read = table[order], line_of_read[order]
     repeated = np.concatenate(
         [
             [False],
@@ -126,9 +117,47 @@ def import_table(
         ]
     )
     if repeated.any():
-        rejected["repeats the read before it"] = int(repeated.sum())
+        rejected.lines_by_reason["repeats the read before it"] = sorted(line_of_read[repeated].tolist())
         table = table[~repeated]
-    return table, times.audit, ImportReport(chosen.name, num_rows, table.num_reads, dict(rejected), tuple(notes))
+    return table, times.audit, ImportReport(chosen.name, num_rows, table.num_reads, rejected, tuple(notes))
+
+
+def _reads(
+    path: Path, lines: Sequence[str], chosen: Format, hop_table_hz: Sequence[float] | None
+) -> tuple[list[Read], np.ndarray, int, Rejected]:
+    """The reads of a table, the line number of each, the number of rows, and the rejected rows."""
+    rejected = Rejected()
+    try:
+        split, body = chosen.row_parser(list(numbered(lines)))
+    except RowError as error:
+        raise RecordingError(f"{path}: {error}. Check format=, or copy the file again.") from error
+
+    def read_row(text: str) -> Read:
+        return _checked(chosen.read(split(text)), hop_table_hz)
+
+    found = read_rows(body, read_row, rejected)
+    known = [read.carrier_hz for _, read in found if read.carrier_hz is not None]
+    if known:
+        middle_hz = float(np.median(known))
+        far = [abs((read.carrier_hz or middle_hz) - middle_hz) > _MAX_CARRIER_DIFFERENCE_HZ for _, read in found]
+        for (line, _), is_far in zip(found, far, strict=True):
+            if is_far:
+                rejected.add("carrier is outside the band of the other rows", line)
+        found = [one for one, is_far in zip(found, far, strict=True) if not is_far]
+    for name in ("reader_ns", "host_ns"):  # a few rows without a time do not take it from the others
+        lacking = [getattr(read, name) is None for _, read in found]
+        if 0 < sum(lacking) <= MAX_SET_ASIDE * len(found):
+            for (line, _), is_lacking in zip(found, lacking, strict=True):
+                if is_lacking:
+                    rejected.add("a time is missing", line)
+            found = [one for one, is_lacking in zip(found, lacking, strict=True) if not is_lacking]
+    if len(found) < (1 - MAX_REJECTED) * len(body) or not found:
+        reasons = "; ".join(rejected.texts()[:3]) or "no row"
+        raise RecordingError(
+            f"{path}: {len(body) - len(found)} of {len(body)} rows are not valid {chosen.name} reads ({reasons}). Check format "
+            "and units; set format= to one of " + ", ".join(FORMATS) + "."
+        )
+    return [read for _, read in found], np.array([line for line, _ in found]), len(body), rejected
 
 
 def _choose(path: Path, lines: list[str], name: str) -> Format:
@@ -138,14 +167,15 @@ def _choose(path: Path, lines: list[str], name: str) -> Format:
         return FORMATS[name]
     found = recognise(lines)
     if found is None:
-        head = lines[0][:120] if lines else "nothing"
+        head = next((line for line in lines if line.strip()), "")
         raise RecordingError(
-            f"{path}: found no known header (first line: {head!r}). Known formats: {', '.join(FORMATS)}; set format= if it is one."
+            f"{path}: found no known header (first line: {shortened(head)}). Known formats: {', '.join(FORMATS)}; set format= if it is one."
         )
     return found
 
 
-def _checked(read: Read) -> Read:
+def _checked(read: Read, hop_table_hz: Sequence[float] | None) -> Read:
+    """The read, if its values are within their domains. Raises `RowError`."""
     if read.phase_rad is None:
         raise RowError("phase is absent")
     if not 1 <= read.antenna <= _MAX_NUMBER:
@@ -158,6 +188,12 @@ def _checked(read: Read) -> Read:
         raise RowError("RSSI is outside -120 to 20 dBm: wrong unit?")
     if read.carrier_hz is not None and not 300e6 <= read.carrier_hz <= 6e9:
         raise RowError("carrier is outside 0.3 to 6 GHz: wrong unit?")
+    if read.doppler_hz is not None and abs(read.doppler_hz) > _MAX_DOPPLER_HZ:
+        raise RowError(f"Doppler shift is outside -{_MAX_DOPPLER_HZ:g} to {_MAX_DOPPLER_HZ:g} Hz: wrong unit?")
+    if hop_table_hz is None or read.carrier_hz is not None or read.channel_index is None:
+        return read
+    if not 1 <= read.channel_index <= len(hop_table_hz):
+        raise RowError(f"channel index is outside the hop table, which has entries 1 to {len(hop_table_hz)}")
     return read
 
 
@@ -263,11 +299,7 @@ def _carriers(
         index = np.array([read.channel_index for read in reads], np.int16)
     unknown = np.isnan(carrier)
     if unknown.any() and hop_table_hz is not None and index is not None:
-        if index.min() < 1 or index.max() > len(hop_table_hz):
-            raise RecordingError(
-                f"Channel indices {index.min()} to {index.max()}; the hop table has entries 1 to {len(hop_table_hz)}."
-            )
-        carrier = np.where(unknown, np.asarray(hop_table_hz, float)[index - 1], carrier)
+        carrier = np.where(unknown, np.asarray(hop_table_hz, float)[np.where(unknown, index, 1) - 1], carrier)
     elif unknown.any() and carrier_hz is not None:
         carrier = np.where(unknown, carrier_hz, carrier)
     elif unknown.any():
