@@ -95,7 +95,10 @@ def test_results_are_a_table_with_failures_and_commands(tmp_path: Path, counted:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"kinds": ["tables", "nothing"]}, "expected different ones of tables, real_tables, weights"),
+        (
+            {"kinds": ["tables", "nothing"]},
+            "expected different ones of clocks, names, targets, tables, real_tables, weights",
+        ),
         ({"kinds": ["tables", "tables"]}, "expected different ones"),
         ({"number": 0}, "expected at least 1 and 0"),
         ({"seed": -1}, "expected at least 1 and 0"),
@@ -135,8 +138,8 @@ def test_the_command_writes_and_prints_its_results(tmp_path: Path) -> None:
     run = [sys.executable, "-m", "experiments.fault_trial", "number=20", "progress=false", f"hydra.run.dir={tmp_path}"]
     done = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
-    assert "| all | 40 | 0 |" in done.stdout
+    assert "| all | 120 | 0 |" in done.stdout
     results = json.loads(done.stdout.splitlines()[-1])
     assert results == read_results(tmp_path / "fault_trial.json")
-    assert list(results["kinds"]) == ["tables", "weights"]
+    assert list(results["kinds"]) == ["clocks", "names", "targets", "tables", "weights"]
     assert (tmp_path / "config.yaml").is_file()

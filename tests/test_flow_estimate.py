@@ -589,19 +589,11 @@ def test_a_variant_differs_by_its_octaves_and_medians_only(name):
     assert VARIANTS[name] == ("pyramid", changes)
 
 
-@pytest.mark.parametrize("name", [*sorted(CLASSICAL), "pyramid"])
-def test_flow_files_name_every_setting(name):
-    settings = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-    given = set(settings) - {"_target_"}
-    if name == "pyramid":
-        built = eqx.filter_eval_shape(make_network, settings)
-        assert eqx.tree_equal(built, eqx.filter_eval_shape(PyramidFlow))
-        assert given == set(inspect.signature(PyramidFlow).parameters) - {"seed"}
-    else:
-        built = make_network(settings)
-        assert given == set(inspect.signature(type(built)).parameters)
-        pictures = texture(48, 64), np.roll(texture(48, 64), 2, axis=1)
-        np.testing.assert_array_equal(built(*pictures), make_flow(name)(*pictures))
+def test_the_file_of_the_pyramid_names_every_setting():
+    settings = yaml.safe_load((CONF / "pyramid.yaml").read_text())
+    built = eqx.filter_eval_shape(make_network, settings)
+    assert eqx.tree_equal(built, eqx.filter_eval_shape(PyramidFlow))
+    assert set(settings) - {"_target_"} == set(inspect.signature(PyramidFlow).parameters) - {"seed"}
 
 
 @pytest.mark.parametrize("name", ["pyramid", "pyramid_fast"])

@@ -10,7 +10,7 @@ import numpy as np
 from ...core.errors import RecordingError
 from ...core.names import safe_file_name
 from ...recording import Intrinsics, Recording, TagReads
-from .outcome import Outcome
+from .outcome import Outcome, outcome
 
 _PIECES = (
     "a",
@@ -40,14 +40,13 @@ def trial(number: int, seed: int, folder: Path) -> list[Outcome]:
     escaped, passed = [], []
     for _ in range(number):
         text = "".join(rng.choice(_PIECES, size=int(rng.integers(0, 40))))
-        if (folder / safe_file_name(text)).resolve().parent != folder.resolve():
-            escaped.append(repr(text)[:80])
+        stays = (folder / safe_file_name(text)).resolve().parent == folder.resolve()
+        escaped.append(None if stays else repr(text))
         odd = set(text) & set("/\\\0$[]={}\n<>%'\"\u202e")
-        if odd and _is_accepted(text):
-            passed.append(repr(text)[:80])
+        passed.append(repr(text) if odd and _is_accepted(text) else None)
     return [
-        Outcome("names: file names stay in their folder", number, len(escaped), tuple(escaped[:3])),
-        Outcome("names: odd names of recordings are refused", number, len(passed), tuple(passed[:3])),
+        outcome("names, file names stay in their folder", escaped),
+        outcome("names, odd ones are refused", passed),
     ]
 
 

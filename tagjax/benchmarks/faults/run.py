@@ -27,7 +27,7 @@ OnProgress = Callable[[str, int, int], None]
 class FaultTrialSettings:
     """Which faults are tried, and how many of each kind."""
 
-    kinds: tuple[str, ...] = ("tables", "weights")
+    kinds: tuple[str, ...] = ("clocks", "names", "targets", "tables", "weights")
     number: int = 1000
     seed: int = 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import random
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from ...core.settings import ConfigError
 from ...flow.networks import NETWORKS
 from ...tagattention.tracer_settings import TRACERS
 from ...training.optimizers import OPTIMIZERS, SCHEDULES
-from .outcome import Outcome
+from .outcome import Outcome, joined, outcome
 
 SLOTS: Mapping[str, Slot] = {
     "tracer": TRACERS,
@@ -28,13 +29,15 @@ SLOTS: Mapping[str, Slot] = {
 
 
 def trial(number: int, seed: int, folder: Path) -> list[Outcome]:
-    """Everything that can be called in tagjax, Optax and the standard library's `os`, as `_target_` of every place."""
+    """`number` of the things that can be called in tagjax and Optax, as `_target_` of each place in turn."""
+    rng = random.Random(seed)
     names = sorted({*_callables(tagjax), *_callables(optax), "os.system", "subprocess.run", "builtins.exec", ""})
-    outcomes = []
-    for place, slot in SLOTS.items():
-        wrong = [name for name in names if (name in slot) is not _is_found(name, slot)]
-        outcomes.append(Outcome(f"targets: {place}", len(names), len(wrong), tuple(wrong[:3])))
-    return outcomes
+    found = []
+    for draw in range(number):
+        (place, slot), name = list(SLOTS.items())[draw % len(SLOTS)], rng.choice(names)
+        fault = None if _is_found(name, slot) is (name in slot) else name
+        found.append(outcome(f"settings, {place}", [fault]))
+    return joined(found)
 
 
 def _is_found(name: str, slot: Slot) -> bool:
