@@ -520,6 +520,7 @@ def test_clock_offset_and_drift_are_recovered(offset_s, drift_ppm):
     audit = to_host_clock(stamps, reads.time_ns).audit
     (piece,) = audit.pieces
     np.testing.assert_allclose(piece.drift_ppm, drift_ppm, atol=5)
+    assert piece.drift_interval_ppm is not None
     low, high = piece.drift_interval_ppm
     assert low < drift_ppm < high
     drifted_s = drift_ppm * 1e-6 * (piece.reference_ns - stamps[0]) * 1e-9

@@ -53,7 +53,7 @@ def test_a_run_folder_calls_nothing_but_the_classes_of_each_place(call, tmp_path
     marker = tmp_path / "written"
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)
-    values = {"tracer": TRACER, "optimizer": ADAM, **_filled(CALLS[call], str(marker))}
+    values = _filled({"tracer": TRACER, "optimizer": ADAM, **CALLS[call]}, str(marker))
     OmegaConf.save(OmegaConf.create(values), run / "config.yaml")
     config = from_mapping(EvaluateConfig, {"run": str(run), "recordings": ["nowhere.zarr"]})
     with pytest.raises(ValueError, match=r"run|_target_|heckpoint") as refusal:

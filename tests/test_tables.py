@@ -172,6 +172,7 @@ def test_clock_audit_recovers_offset_and_drift_through_latency():
     found = to_host_clock(reader, host)
     (piece,) = found.audit.pieces
     assert abs(piece.drift_ppm - 40) < 5
+    assert piece.drift_interval_ppm is not None
     low, high = piece.drift_interval_ppm
     assert low < 40 < high
     assert abs(piece.offset_s - (0.404 + 40e-6 * (piece.reference_ns - reader[0]) * 1e-9)) < 0.002
@@ -221,6 +222,7 @@ def test_real_tables(real_data, path, name, rate):
         assert audit is not None
         assert len(audit.pieces) == 1
         assert audit.num_set_aside == 0
+        assert audit.pieces[0].drift_interval_ppm is not None
         low, high = audit.pieces[0].drift_interval_ppm
         assert 20 < low < high < 40
         assert audit.residual_ms < 3
