@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
-import multiprocessing.connection
 import os
 import signal
 import threading
@@ -15,6 +13,8 @@ from typing import Any
 import grain
 import jax
 from absl import flags
+
+from .worker_process import end_with_parent
 
 _GRACE_PERIOD_S = 60.0
 """A worker that got SIGTERM goes on serving samples for so long."""
@@ -100,15 +100,8 @@ def _begin_worker(index: int, count: int) -> None:
     jax.config.update("jax_platforms", "cpu")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: threading.Thread(target=exit_later, daemon=True).start())
-    parent = multiprocessing.parent_process()
-    assert parent is not None
+    end_with_parent()
 
     def exit_later() -> None:
         time.sleep(_GRACE_PERIOD_S)
         os._exit(1)
-
-    def exit_with_parent() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=exit_with_parent, daemon=True).start()
