@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import json
 import multiprocessing
+import os
 import shutil
+import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -16,8 +19,10 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from ..core.files import atomic_path, write_atomic
+from ..core.files import atomic_path, make_folder, write_atomic, writing
+from ..core.interruption import exit_status
 from ..core.settings import ConfigError
+from ..core.worker_process import end_with_parent
 from ..recording import RecordingError
 from ..recording.store import save_recording
 from ..recording.suite_folder import SPLITS
@@ -203,7 +208,7 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
     """
     home = folder / suite.name
     manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
-    if home.exists():
+    if home.exists() and not all(path.name.startswith(".") for path in home.iterdir()):
         try:
             found = json.loads((home / MANIFEST).read_text())
         except (OSError, ValueError) as error:
@@ -219,8 +224,7 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
                 "remove this one."
             )
     else:
-        home.mkdir(parents=True)
-        differs = {"counts"}
+        differs = {"counts"}  # a new folder, or one whose suite.json could not be written
     if differs:
         write_atomic(home / MANIFEST, json.dumps(manifest, indent=1) + "\n")
     for partial in home.glob("*/.*.partial"):
@@ -241,8 +245,8 @@ def make_suite(
     Each recording is determined by its seed alone, so the number of workers changes nothing in it. Several processes may
     call this at once: one simulates, the others wait and find the recordings there.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / f".{suite.name}.lock"):
+    make_folder(folder)
+    with writing(folder / suite.name), FileLock(folder / f".{suite.name}.lock"):
         missing = [item for item in prepare(suite, folder) if wanted(item)]
         return _make_items(missing, folder, workers, on_done or (lambda made: None))
 
@@ -259,18 +263,52 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
             finished(make_item(item, folder))
         return made
     # Spawned, not forked: JAX's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(items)), mp_context=context) as pool:
-        waiting = {pool.submit(make_item, item, folder) for item in items}
+    context, others = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
+    with ProcessPoolExecutor(min(workers, len(items)), mp_context=context, initializer=_begin_worker) as pool:
         try:
+            with _signals_blocked():
+                waiting = {pool.submit(make_item, item, folder) for item in items}
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
                     finished(future.result())
-        except BaseException:
+        except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):  # after another error, the recordings in progress are finished
+                for worker in set(multiprocessing.active_children()) - others:
+                    worker.terminate()
             raise
     return made
+
+
+@contextlib.contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """Processes that are started in the block never get Ctrl-C, and SIGTERM only from `_begin_worker` on.
+
+    The terminal sends Ctrl-C to all of them, and a scheduler SIGTERM; while they import, either would give a traceback. This
+    process gets a signal of that time at the end of the block.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin_worker() -> None:
+    """SIGTERM ends a worker without a traceback, and what it has written of a recording is removed."""
+
+    def end(number: int, frame: Any) -> None:
+        raise SystemExit(exit_status(number))
+
+    end_with_parent()
+    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(exit_status(number)))
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # one that came during the imports ends it here
+    signal.signal(signal.SIGTERM, end)
 
 
 def make_items(
