@@ -267,7 +267,7 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
     with ProcessPoolExecutor(min(workers, len(items)), mp_context=context, initializer=_begin_worker) as pool:
         try:
             with _signals_blocked():
-                waiting = {pool.submit(make_item, item, folder) for item in items}
+                waiting = {pool.submit(_make_in_worker, item, folder) for item in items}
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -296,6 +296,14 @@ def _signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _make_in_worker(item: Item, folder: Path) -> Made:
+    """`make_item` in a worker, which ends after SIGTERM; the pool itself would give it the next item."""
+    try:
+        return make_item(item, folder)
+    except SystemExit:
+        os._exit(exit_status(signal.SIGTERM))
 
 
 def _begin_worker() -> None:
