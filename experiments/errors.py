@@ -58,7 +58,11 @@ def ending_in_one_line(command: str) -> Iterator[None]:
                 cause = [str(error.__cause__)] if isinstance(error.__cause__, OmegaConfBaseException) else []
                 raise SystemExit("\n".join([str(error), *cause])) from error
             if isinstance(error, OSError) and (number := refusal(error)) is not None:
-                refused = error if isinstance(error, WriteError) else WriteError(error.filename or "a file", number)
+                refused = (
+                    error
+                    if isinstance(error, WriteError)
+                    else WriteError(error.filename or "Hydra's part of the run folder (.hydra)", number)
+                )
                 raise SystemExit(f"{command}: {refused}") from error
             raise
 
