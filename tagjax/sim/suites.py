@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import json
@@ -11,7 +10,7 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from filelock import FileLock
 from ..core.files import atomic_path, make_folder, write_atomic, writing
 from ..core.interruption import exit_status
 from ..core.settings import ConfigError
-from ..core.worker_process import end_with_parent
+from ..core.worker_process import end_with_parent, signals_blocked, unblock_sigterm
 from ..recording import RecordingError
 from ..recording.store import save_recording
 from ..recording.suite_folder import SPLITS
@@ -266,7 +265,7 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
     context, others = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
     with ProcessPoolExecutor(min(workers, len(items)), mp_context=context, initializer=_begin_worker) as pool:
         try:
-            with _signals_blocked():
+            with signals_blocked():
                 waiting = {pool.submit(_make_in_worker, item, folder) for item in items}
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -279,23 +278,6 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
                     worker.terminate()
             raise
     return made
-
-
-@contextlib.contextmanager
-def _signals_blocked() -> Iterator[None]:
-    """Processes that are started in the block never get Ctrl-C, and SIGTERM only from `_begin_worker` on.
-
-    The terminal sends Ctrl-C to all of them, and a scheduler SIGTERM; while they import, either would give a traceback. This
-    process gets a signal of that time at the end of the block.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _make_in_worker(item: Item, folder: Path) -> Made:
@@ -314,8 +296,7 @@ def _begin_worker() -> None:
 
     end_with_parent()
     signal.signal(signal.SIGTERM, lambda number, frame: os._exit(exit_status(number)))
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # one that came during the imports ends it here
+    unblock_sigterm()  # one that came during the imports ends the worker here
     signal.signal(signal.SIGTERM, end)
 
 
