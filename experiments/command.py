@@ -12,7 +12,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from .errors import errors_in_one_line
+from .errors import ending_in_one_line, errors_in_one_line
 from .help import command_help
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -23,7 +23,7 @@ T = TypeVar("T")
 OmegaConf.register_new_resolver("command_help", functools.partial(command_help, CONF), replace=True)
 
 
-def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], Any]:
+def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], None]:
     """The entry point of a module `experiments/<name>.py`, configured by Hydra from conf/<name>.yaml.
 
     `function` receives the configuration as plain values and the run folder. A number that it returns is a sweep's objective.
@@ -35,7 +35,14 @@ def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], Any
         with errors_in_one_line(name):
             return function(plain_values(config), Path(HydraConfig.get().runtime.output_dir))
 
-    return hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(run)
+    configured = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(run)
+
+    @functools.wraps(function)
+    def main() -> None:
+        with ending_in_one_line(name):
+            configured()
+
+    return main
 
 
 def plain_values(config: DictConfig) -> dict[str, Any]:

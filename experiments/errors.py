@@ -1,33 +1,89 @@
-"""How a command reports an error."""
+"""How a command reports an error, and how it ends after Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException
 from hydra.types import RunMode
+from omegaconf.errors import OmegaConfBaseException
+
+from tagjax.core.files import WriteError, refusal
+from tagjax.core.interruption import exit_status, interruption, last_signal, message, raise_on_signals, signal_number
+
+_FULL_ERROR = "HYDRA_FULL_ERROR"
+
+TRACEBACK_WANTED = os.environ.get(_FULL_ERROR, "0") not in ("", "0")
+"""Whether the user wants tracebacks (HYDRA_FULL_ERROR=1); read once, because `ending_in_one_line` sets the variable."""
 
 
 @contextlib.contextmanager
 def errors_in_one_line(command: str, *more: type[Exception]) -> Iterator[None]:
-    """Errors that the user can correct (`ValueError`, a missing file, and `more`) and Ctrl-C end the command in one line.
+    """Errors that the user can correct (`ValueError`, `OSError`, and `more`) end the command in one line, with status 1.
 
-    The exit status is 1, and 130 after Ctrl-C. HYDRA_FULL_ERROR=1 shows the traceback. The jobs of a sweep raise the
-    error itself, so that Hydra can tell failed jobs from others.
+    HYDRA_FULL_ERROR=1 shows the traceback. The jobs of a sweep raise the error itself, so that Hydra can tell failed jobs
+    from others. An error that follows from Ctrl-C or SIGTERM becomes the exception of that signal.
     """
     try:
         yield
-    except (ValueError, FileNotFoundError, *more) as error:
-        if os.environ.get("HYDRA_FULL_ERROR", "0") not in ("", "0") or sweeping():
+    except Exception as error:
+        if (number := last_signal()) is not None:
+            raise interruption(number) from error
+        if not isinstance(error, (ValueError, OSError, *more)) or TRACEBACK_WANTED or sweeping():
             raise
         raise SystemExit(f"{command}: {error}") from error
-    except KeyboardInterrupt:
-        if sweeping():
+
+
+@contextlib.contextmanager
+def ending_in_one_line(command: str) -> Iterator[None]:
+    """For the whole of a command, with Hydra's part: Ctrl-C and SIGTERM end it in one line, with status 130 and 143.
+
+    A run folder that Hydra cannot write ends it in one line as well, with status 1.
+    """
+    with raise_on_signals(), _hydra_raises_errors():
+        try:
+            yield
+        except KeyboardInterrupt as error:
+            raise _ended(command, signal_number(error)) from None
+        except Exception as error:
+            if (number := last_signal()) is not None:
+                raise _ended(command, number) from error
+            if TRACEBACK_WANTED:
+                raise
+            if isinstance(error, CompactHydraException):  # Hydra has written it for the user
+                cause = [str(error.__cause__)] if isinstance(error.__cause__, OmegaConfBaseException) else []
+                raise SystemExit("\n".join([str(error), *cause])) from error
+            if isinstance(error, OSError) and (number := refusal(error)) is not None:
+                refused = (
+                    error
+                    if isinstance(error, WriteError)
+                    else WriteError(error.filename or "Hydra's part of the run folder (.hydra)", number)
+                )
+                raise SystemExit(f"{command}: {refused}") from error
             raise
-        print(f"\n{command}: interrupted.", flush=True)
-        raise SystemExit(130) from None
+
+
+def _ended(command: str, number: int) -> SystemExit:
+    print(f"\n{command}: {message(number)}", file=sys.stderr, flush=True)
+    return SystemExit(exit_status(number))
+
+
+@contextlib.contextmanager
+def _hydra_raises_errors() -> Iterator[None]:
+    """By default Hydra prints the traceback of an error in its own code and ends the process itself."""
+    before = os.environ.get(_FULL_ERROR)
+    os.environ[_FULL_ERROR] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_FULL_ERROR]
+        else:
+            os.environ[_FULL_ERROR] = before
 
 
 def sweeping() -> bool:

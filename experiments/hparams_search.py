@@ -8,9 +8,6 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from .errors import sweeping
-from .run_folder import checkpoint_steps
-
 
 def trials_left(
     num_trials: int, storage: str, study: str, folder: str, launched: str = "", *, _root_: DictConfig | None = None
@@ -50,13 +47,9 @@ def _without_score(config: DictConfig) -> bool:
     return bool(training) and not validation and not any("data.validation" in one for one in swept)
 
 
-def sweep_score(score: float, folder: Path, num_steps: int) -> float | None:
+def sweep_score(score: float) -> float | None:
     """The number that a training run returns to its sweep: None for NaN, which marks the trial as failed.
 
-    NaN itself would end an Optuna sweep. Raises `KeyboardInterrupt` in a sweep if the run was stopped before its last step:
-    that is no failure, and later jobs must not start. The run's checkpoint has been written.
+    NaN itself would end an Optuna sweep.
     """
-    steps = checkpoint_steps(folder)
-    if math.isnan(score) and sweeping() and steps and max(steps) < num_steps:
-        raise KeyboardInterrupt
     return None if math.isnan(score) else score

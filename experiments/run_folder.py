@@ -27,26 +27,30 @@ _MAY_DIFFER_SUFFIXES = ("workers", "decay_steps")  # decay_steps follows loop.nu
 _RETUNABLE = ("clip_norm", "optimizer", "joint.clip_norm", "joint.optimizer")
 
 
-def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
-    """Write `config.yaml` if the run is new, or resumes with the same configuration.
+def check_configuration(folder: Path, values: Mapping[str, Any]) -> None:
+    """Raise `ValueError`, naming the differences, if the folder holds a run that cannot resume with these values.
 
     A resumed run may have another length, logger, scores and processes. With `retune` it may also have other numbers of the
-    optimiser, but no other kind, because its state would have another shape. Raises `ValueError`, naming the differences,
-    where anything else differs, and leaves the file unchanged. With `resume=false` the file is left unchanged as well: the
+    optimiser, but no other kind, because its state would have another shape. With `resume=false` nothing is compared: the
     run itself then refuses to overwrite a checkpoint.
     """
     path = folder / "config.yaml"
-    if checkpoint_steps(folder) and path.is_file():
-        if not values.get("resume", True):
-            return
-        before = read_configuration(path)
-        differences = _differences(before, dict(values), retune=bool(values.get("retune", False)))
-        if differences:
-            raise ValueError(
-                f"{folder} holds a run with another configuration: {'; '.join(differences)}. Give the same settings to resume it "
-                "(retune=true allows another clip_norm and other numbers of the optimiser), or another folder."
-            )
-    write_config(values, folder)
+    if not checkpoint_steps(folder) or not path.is_file() or not values.get("resume", True):
+        return
+    before = read_configuration(path)
+    differences = _differences(before, dict(values), retune=bool(values.get("retune", False)))
+    if differences:
+        raise ValueError(
+            f"{folder} holds a run with another configuration: {'; '.join(differences)}. Give the same settings to resume it "
+            "(retune=true allows another clip_norm and other numbers of the optimiser), or another folder."
+        )
+
+
+def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
+    """Write `config.yaml` if the run is new, or resumes (`check_configuration`). The caller holds the folder's lock."""
+    check_configuration(folder, values)
+    if values.get("resume", True) or not checkpoint_steps(folder) or not (folder / "config.yaml").is_file():
+        write_config(values, folder)
 
 
 def read_configuration(path: Path) -> dict[str, Any]:

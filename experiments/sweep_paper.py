@@ -21,6 +21,7 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> float:
     from rich.console import Console
 
+    from tagjax.core.folder_lock import locked_folder
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.sweep import SweepConfig, run_sweep, table
 
@@ -28,14 +29,15 @@ def main(values: dict[str, Any], folder: Path) -> float:
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = from_mapping(SweepConfig, {**values, "suites": suites_named(values["suites"])})
-    write_config(values, folder)
     with counting_bar(console, shown=progress) as bar:
         task = bar.add_task("sweep", total=None)
 
         def report(done: int, total: int, name: str) -> None:
             bar.update(task, completed=done, total=total or None, description=name)
 
-        rows = table(run_sweep(config, folder, on_progress=report))
+        with locked_folder(folder):
+            write_config(values, folder)
+            rows = table(run_sweep(config, folder, on_progress=report))
     console.print((folder / "table.md").read_text(), soft_wrap=True, highlight=False)
     console.print(f"table.md, table.csv, sweep.png, lines.jsonl in {folder}", soft_wrap=True, highlight=False)
     print_result(rows)

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from .command import command
 from .errors import errors_in_one_line
 from .hparams_search import sweep_score, trials_left
-from .run_folder import keep_configuration
+from .run_folder import check_configuration, keep_configuration
 from .suites import suite_recordings
 
 OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
@@ -37,11 +37,11 @@ def main(values: dict[str, Any], folder: Path) -> float | None:
         data["recordings"] = suite_recordings(suite, "train", recordings_dir)
         data["validation"] = suite_recordings(suite, "validation", recordings_dir)
     config = from_mapping(TrainConfig, values)
-    keep_configuration(folder, values)
+    check_configuration(folder, values)
     with errors_in_one_line("train", DivergedError):
-        score = sweep_score(run_training(config, folder), folder, config.loop.num_steps)
+        score = run_training(config, folder, on_start=lambda: keep_configuration(folder, values))
     print(f"run folder: {folder}")
-    return score
+    return sweep_score(score)
 
 
 if __name__ == "__main__":

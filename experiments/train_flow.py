@@ -13,7 +13,7 @@ from typing import Any
 from .command import command
 from .errors import errors_in_one_line
 from .hparams_search import sweep_score
-from .run_folder import keep_configuration
+from .run_folder import check_configuration, keep_configuration
 
 
 @command
@@ -24,11 +24,11 @@ def main(values: dict[str, Any], folder: Path) -> float | None:
     from tagjax.training.loop import DivergedError
 
     config = from_mapping(TrainFlowConfig, values)
-    keep_configuration(folder, values)
+    check_configuration(folder, values)
     with errors_in_one_line("train_flow", DivergedError):
-        score = sweep_score(run_flow_training(config, folder), folder, config.loop.num_steps)
+        score = run_flow_training(config, folder, on_start=lambda: keep_configuration(folder, values))
     print(f"run folder: {folder}")
-    return score
+    return sweep_score(score)
 
 
 if __name__ == "__main__":

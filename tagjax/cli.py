@@ -10,9 +10,12 @@ import importlib
 import importlib.util
 from collections.abc import Callable
 
+from .core.interruption import exit_on_signals
+
 
 def _command(name: str) -> Callable[[], None]:
     def run() -> None:
+        exit_on_signals()  # until the command itself handles them, that is during its imports
         package = next(one for one in ("tagjax.experiments", "experiments") if importlib.util.find_spec(one))
         importlib.import_module(f"{package}.{name}").main()
 

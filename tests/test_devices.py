@@ -14,9 +14,9 @@ import pytest
 from tagjax.training.devices import check_batch, replicate, shard, unreplicate
 from tagjax.training.processes import (
     DistributedSettings,
-    any_process,
     broadcast_arrays,
     local_batch_size,
+    max_over_processes,
     mean_over_processes,
 )
 
@@ -116,8 +116,8 @@ def test_one_device_leaves_everything_where_it_is():
     for leave in (shard, replicate, unreplicate, mean_over_processes, broadcast_arrays):
         assert leave(batch) is batch
     assert local_batch_size(3) == 3
-    assert any_process(True)
-    assert not any_process(False)
+    assert max_over_processes(15) == 15
+    assert max_over_processes(0) == 0
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from experiments import errors
 from experiments.errors import errors_in_one_line
 
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("error", [ValueError("no such tag"), FileNotFoundError("no such tag")])
+@pytest.mark.parametrize("error", [ValueError("no such tag"), FileNotFoundError("no such tag"), OSError("no such tag")])
 def test_what_can_be_mended_is_said_errors_in_one_line(error: Exception) -> None:
     with pytest.raises(SystemExit, match=r"^trace: no such tag$") as ended, errors_in_one_line("trace"):
         raise error
@@ -28,16 +29,9 @@ def test_other_errors_keep_their_traceback_unless_listed() -> None:
 
 
 def test_the_place_is_shown_on_demand(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setattr(errors, "TRACEBACK_WANTED", True)
     with pytest.raises(ValueError, match="no such tag"), errors_in_one_line("trace"):
         raise ValueError("no such tag")
-
-
-def test_ctrl_c_ends_with_its_own_status(capsys: pytest.CaptureFixture) -> None:
-    with pytest.raises(SystemExit) as ended, errors_in_one_line("trace"):
-        raise KeyboardInterrupt
-    assert ended.value.code == 130
-    assert "trace: interrupted" in capsys.readouterr().out
 
 
 def test_the_command_ends_with_the_known_choices(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
     recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def moved(state: TrainState, *_: Any, **__: Any) -> TrainingResult[TrainState]:
-        return TrainingResult(eqx.tree_at(lambda one: one.model, state, learned), interrupted=False)
+        return TrainingResult(eqx.tree_at(lambda one: one.model, state, learned))
 
     values = _values(recordings)
     values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}

@@ -399,9 +399,9 @@ def test_a_run_is_gone_on_with_only_where_that_is_allowed(tmp_path: Path) -> Non
 
 def test_resuming_is_exact_bit_for_bit(tmp_path: Path) -> None:
     straight = _run(tmp_path / "straight", 6)
-    assert not straight.interrupted
+    assert straight.stopped_by == 0
     first = _run(tmp_path / "broken", 6, interrupt_at=2)  # between checkpoints
-    assert first.interrupted
+    assert first.stopped_by == signal.SIGINT
     assert int(first.state.step) == 2
     resumed = _run(tmp_path / "broken", 6)
     for one, two in zip(jax.tree.leaves(straight.state), jax.tree.leaves(resumed.state), strict=True):
@@ -464,7 +464,7 @@ def test_a_scheduler_s_sigterm_saves_and_ends_the_run(tmp_path: Path) -> None:
 
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     trained, steps = _count(tmp_path, 6, after_step=after_step)
-    assert trained.interrupted
+    assert trained.stopped_by == signal.SIGTERM
     assert steps == [2]
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 

@@ -19,7 +19,7 @@ import numpy as np
 import zarr
 from rich.progress import Progress
 
-from .files import write_atomic
+from .files import make_folder, write_atomic, writing
 from .types import LazyArray
 
 _ARRAY, _NUM_ROWS = "array", "num_rows"
@@ -38,12 +38,13 @@ def compute_once(
 
     Of several processes one computes, and the others wait for it. A `target` that is not complete is removed first.
     After an error, Ctrl-C or a kill the rows that `write_rows` has finished stay, and the next process resumes after
-    them; other partial results are removed, at the latest by the next process.
+    them; other partial results are removed, at the latest by the next process. Raises `WriteError` where the file system
+    refuses to write.
     """
     if is_complete(target):
         return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with _lock(target.with_name(f".{target.name}.lock")):
+    make_folder(target.parent)
+    with writing(target), _lock(target.with_name(f".{target.name}.lock")):
         # Another process may have computed it while this one waited.
         if is_complete(target):
             return

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import multiprocessing
-import multiprocessing.connection
 import os
 import reprlib
 import signal
@@ -16,6 +15,8 @@ from typing import Any
 import grain
 import jax
 from absl import flags
+
+from .worker_process import end_with_parent, signals_blocked, unblock_sigterm
 
 _GRACE_PERIOD_S = 60.0
 """A worker that got SIGTERM goes on serving samples for so long."""
@@ -57,8 +58,12 @@ class StreamIterator:
 
     def __next__(self) -> Any:
         if self._samples is None:
-            self._samples = self._open()
-        sample = next(self._samples)
+            # The first sample starts the workers.
+            with signals_blocked() if self._stream.workers else contextlib.nullcontext():
+                self._samples = self._open()
+                sample = next(self._samples)
+        else:
+            sample = next(self._samples)
         self._position += self._stream.shard[1]
         return sample if self._stream.transform is None else self._stream.transform(sample)
 
@@ -104,16 +109,11 @@ def _begin_worker(index: int, count: int) -> None:
     del index, count
     jax.config.update("jax_platforms", "cpu")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda number, frame: threading.Thread(target=exit_later, daemon=True).start())
-    parent = multiprocessing.parent_process()
-    assert parent is not None
 
     def exit_later() -> None:
         time.sleep(_GRACE_PERIOD_S)
         os._exit(1)
 
-    def exit_with_parent() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=exit_with_parent, daemon=True).start()
+    signal.signal(signal.SIGTERM, lambda number, frame: threading.Thread(target=exit_later, daemon=True).start())
+    unblock_sigterm()
+    end_with_parent()

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax
 import numpy as np
 from rich.box import SIMPLE
@@ -22,6 +21,7 @@ from ..core.results import write_json
 from ..flow.opencv import FlowFunction
 from ..flow.registry import flow_key, make_flow, split_suffixes
 from ..metrics.flow import FlowScores, endpoint_error, warped_error
+from ..recording.image_files import write_image
 from ..report.flow import flow_panel
 from ..sim.flow_pairs import FlowPairSettings
 from .flow_cases import FlowCase, Material, drawn_material, folder_material, recording_material, sequence_material
@@ -140,7 +140,6 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
 
 
 def _write(summary: Mapping[str, Any], folder: Path, numbers: str, tables: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / numbers, summary)
     write_atomic(folder / tables, markdown(summary))
 
@@ -175,8 +174,7 @@ class _Scored:
             kept = self._scores[name]
             kept[case.source] = kept.get(case.source, FlowScores()).merge(score)
         if panels is not None:
-            panels.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(panels / f"{safe_file_name(case.label)}.png"), _panel(case, predicted)[..., ::-1])
+            write_image(panels / f"{safe_file_name(case.label)}.png", _panel(case, predicted))
 
     def _call(self, name: str, case: FlowCase) -> np.ndarray:
         start = time.perf_counter()

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.files import write_atomic
+from ..core.files import write_atomic, writing
 from ..core.results import markdown_table, to_json_values, write_csv
 from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
@@ -192,7 +192,7 @@ def frame_iou(result: RecordingResult) -> tuple[float | None, ...]:
 
 
 def _append(path: Path, line: Line) -> None:
-    with path.open("a", encoding="utf-8") as file:
+    with writing(path), path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(to_json_values(dataclasses.asdict(line))) + "\n")
 
 

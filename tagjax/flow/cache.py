@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from rich.progress import track
 from zarr.storage import LocalStore
 
 from ..core.array_cache import compute_once
+from ..core.files import WriteError
 from ..recording import Recording, RecordingError
 from ..recording.stored_frames import StoredFrames, create_array
 from .opencv import FlowFunction
@@ -29,6 +31,9 @@ _DIRECTIONS = ("forward", "backward")
 
 _ABANDONED_S = 3600.0
 """A partial cache of another flow without a change for so long belongs to a process that was killed."""
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Computing the flow of a whole recording again and again is no substitute for space."""
 
 TRUTH = "truth"
 """The name of a simulated recording's exact flow, as an upper limit for what a tracer can do with better flow."""
@@ -56,22 +61,32 @@ def pair_flow(recording: Recording, first: int, last: int, method: str) -> tuple
     key = flow_key(method)
     folder = _folder(recording, key)
     if folder is None:
-        pairs = list(_pairs(recording, first, last, make_flow(method)))
-        return np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
+        return _computed(recording, first, last, method)
     stored = _read(recording, folder, key, first, last)
     if stored is None:
         _remove_abandoned(folder.parent)
-        compute_once(
-            folder,
-            lambda path: _compute(recording, path, key, make_flow(method)),
-            is_complete=lambda path: _read(recording, path, key, first, last) is not None,
-        )
+        try:
+            compute_once(
+                folder,
+                lambda path: _compute(recording, path, key, make_flow(method)),
+                is_complete=lambda path: _read(recording, path, key, first, last) is not None,
+            )
+        except WriteError as error:
+            if error.errno in _FULL:
+                raise
+            return _computed(recording, first, last, method)
         stored = _read(recording, folder, key, first, last)
     if stored is None:
         raise RecordingError(
             f"{folder}: the flow was written but cannot be read back. Remove the folder and check the disk."
         )
     return stored
+
+
+def _computed(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """`pair_flow` without the stored flow."""
+    pairs = list(_pairs(recording, first, last, make_flow(method)))
+    return np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
 
 
 def _time_reversed_flow(recording: Recording, first: int, last: int, method: str) -> tuple[np.ndarray, np.ndarray]:

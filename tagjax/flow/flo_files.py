@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..core.files import write_atomic
 from ..recording import RecordingError
 
 _MAGIC = np.float32(202021.25)
@@ -47,5 +48,5 @@ def write_flo(path: str | Path, flow_px: Float[np.ndarray, "height width 2"]) ->
     height, width, _ = flow_px.shape
     known = np.all(np.isfinite(flow_px), axis=-1, keepdims=True)
     values = np.where(known, flow_px, _UNKNOWN_VALUE_PX).astype("<f4")
-    with Path(path).open("wb") as file:
-        file.write(_MAGIC.astype("<f4").tobytes() + np.array([width, height], "<i4").tobytes() + values.tobytes())
+    header = _MAGIC.astype("<f4").tobytes() + np.array([width, height], "<i4").tobytes()
+    write_atomic(path, header + values.tobytes())

@@ -1,4 +1,7 @@
-"""Image files, read strictly: OpenCV itself fills the missing part of a truncated file without an error."""
+"""Image files, read and written strictly.
+
+OpenCV itself fills the missing part of a truncated file without an error, and leaves half a file on a full disk.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import cv2
 import numpy as np
 
 from ..core.errors import RecordingError
+from ..core.files import write_atomic
 
 
 def natural_sorted(paths: Iterable[Path]) -> list[Path]:
@@ -79,3 +83,14 @@ def read_colour(path: Path) -> np.ndarray:
 def read_labels(path: Path) -> np.ndarray:
     """A label image, uint8 (height, width). Raises `RecordingError` for a truncated or damaged file."""
     return read_image(path, cv2.IMREAD_GRAYSCALE)
+
+
+def write_image(path: Path, image: np.ndarray, *, jpeg_quality: int = 95) -> None:
+    """Write an RGB image (height, width, 3), uint8, as the kind of file that the suffix of `path` names (.png, .jpg).
+
+    The file appears whole or not at all. Raises `WriteError` where the file system refuses to write.
+    """
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if path.suffix == ".jpg" else []
+    encoded, data = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]), parameters)
+    assert encoded
+    write_atomic(path, data.tobytes())

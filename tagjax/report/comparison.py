@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.lines import Line2D
 
-from .figure import blank
+from .figure import blank, save_figure
 
 _ENTRY_IN = 1.5
 """Width of an entry of the legend, inches."""
@@ -48,4 +48,4 @@ def bar_plot(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, float | 
         ncols=min(len(systems) + 1, int(inches / _ENTRY_IN)),
         fontsize=8,
     )
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path, dpi=120)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
-from .figure import blank
+from .figure import blank, save_figure
 
 
 def score_curves(
@@ -47,4 +47,4 @@ def score_curves(
     lower.set(ylabel="CLE (px of 512)", xlabel="frame number (shaded: not scored)")
     lower.set_ylim(bottom=0)
     upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=4)  # beside the title
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)

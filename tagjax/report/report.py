@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
@@ -16,6 +15,7 @@ from ..core.names import plain_label, safe_file_name
 from ..core.results import write_csv, write_json
 from ..metrics.recordings import RecordingResult
 from ..metrics.tracking import Scores, label_box
+from ..recording.image_files import write_image
 from .overlay import draw_overlay, short_name
 
 Results = Mapping[str, Sequence[RecordingResult]]
@@ -40,7 +40,6 @@ def summarise(results: Results) -> dict[str, Any]:
 
 def write_report(folder: Path, results: Results) -> dict[str, Any]:
     """Write the whole report and return its summary."""
-    folder.mkdir(parents=True, exist_ok=True)
     summary = summarise(results)
     write_json(folder / "metrics.json", summary)
     write_frames(folder / "frames.csv", results)
@@ -72,7 +71,6 @@ def _frame_rows(results: Results) -> Iterator[tuple[Any, ...]]:
 
 def write_overlays(folder: Path, result: RecordingResult) -> None:
     """One PNG for each kept frame; true boxes are thin and white."""
-    folder.mkdir(parents=True, exist_ok=True)
     truth = result.recording.truth
     for picture in result.pictures:
         true_boxes = np.full((len(picture.epcs), 4), np.nan)
@@ -91,7 +89,7 @@ def write_overlays(folder: Path, result: RecordingResult) -> None:
             true_boxes_px=true_boxes,
             caption=f"frame {picture.frame}",
         )
-        cv2.imwrite(str(folder / f"frame{picture.frame:06d}.png"), np.ascontiguousarray(drawn[..., ::-1]))
+        write_image(folder / f"frame{picture.frame:06d}.png", drawn)
 
 
 def write_curves(folder: Path, results: Results) -> None:
@@ -104,7 +102,6 @@ def write_curves(folder: Path, results: Results) -> None:
             stacklevel=2,
         )
         return
-    folder.mkdir(parents=True, exist_ok=True)
     reference = next(iter(results.values()), ())
     for number, one in enumerate(reference):
         for epc, frames in one.frames.items():

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from .figure import blank
+from .figure import blank, save_figure
 
 
 def value_text(value: int | float | str | bool) -> str:
@@ -31,7 +31,7 @@ def curve_panels(path: Path, curves: Mapping[str, Mapping[str, Float[np.ndarray,
         axes.set_axis_off()
     panels[0].set_ylabel("box IoU")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=9)
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path, dpi=120)
 
 
 def parameter_panels(path: Path, best: Mapping[str, Mapping[int | float | str | bool, float]]) -> None:
@@ -46,4 +46,4 @@ def parameter_panels(path: Path, best: Mapping[str, Mapping[int | float | str | 
         axes.set(xlabel=name)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("best mean box IoU")
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path, dpi=120)

@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ..recording import Recording, RecordingError
+from ..recording.image_files import write_image
 from ..recording.store import open_recording
 from .radio.planar import PlanarTrials, open_planar
 from .suites import PLANAR, Item, Suite, make_suite
@@ -94,7 +95,7 @@ def save_sheet(suite: Suite, folder: Path) -> Path:
         recordings = [open_recording(item.path(folder), check=False) for item in chosen]
         sheet = contact_sheet(recordings, [item.name for item in chosen])
     path = folder / suite.name / "contact_sheet.png"
-    cv2.imwrite(str(path), sheet[..., ::-1])
+    write_image(path, sheet)
     return path
 
 
@@ -109,7 +110,6 @@ def save_preview(suite: Suite, folder: Path, *, workers: int = 1, width: int = 9
     assert sheet is not None
     shrink = min(1.0, width / sheet.shape[1])
     sheet = cv2.resize(sheet, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{suite.name}.jpg"
-    cv2.imwrite(str(path), sheet, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    write_image(path, sheet[..., ::-1], jpeg_quality=85)
     return path

@@ -6,7 +6,9 @@ import dataclasses
 import itertools
 import json
 import multiprocessing
+import os
 import shutil
+import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -16,8 +18,10 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from ..core.files import atomic_path, write_atomic
+from ..core.files import atomic_path, make_folder, write_atomic, writing
+from ..core.interruption import exit_status
 from ..core.settings import ConfigError
+from ..core.worker_process import end_with_parent, signals_blocked, unblock_sigterm
 from ..recording import RecordingError
 from ..recording.store import save_recording
 from ..recording.suite_folder import SPLITS
@@ -203,7 +207,7 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
     """
     home = folder / suite.name
     manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
-    if home.exists():
+    if home.exists() and not all(path.name.startswith(".") for path in home.iterdir()):
         try:
             found = json.loads((home / MANIFEST).read_text())
         except (OSError, ValueError) as error:
@@ -219,8 +223,7 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
                 "remove this one."
             )
     else:
-        home.mkdir(parents=True)
-        differs = {"counts"}
+        differs = {"counts"}  # a new folder, or one whose suite.json could not be written
     if differs:
         write_atomic(home / MANIFEST, json.dumps(manifest, indent=1) + "\n")
     for partial in home.glob("*/.*.partial"):
@@ -241,8 +244,8 @@ def make_suite(
     Each recording is determined by its seed alone, so the number of workers changes nothing in it. Several processes may
     call this at once: one simulates, the others wait and find the recordings there.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / f".{suite.name}.lock"):
+    make_folder(folder)
+    with writing(folder / suite.name), FileLock(folder / f".{suite.name}.lock"):
         missing = [item for item in prepare(suite, folder) if wanted(item)]
         return _make_items(missing, folder, workers, on_done or (lambda made: None))
 
@@ -259,18 +262,42 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
             finished(make_item(item, folder))
         return made
     # Spawned, not forked: JAX's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(items)), mp_context=context) as pool:
-        waiting = {pool.submit(make_item, item, folder) for item in items}
+    context, others = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
+    with ProcessPoolExecutor(min(workers, len(items)), mp_context=context, initializer=_begin_worker) as pool:
         try:
+            with signals_blocked():
+                waiting = {pool.submit(_make_in_worker, item, folder) for item in items}
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
                     finished(future.result())
-        except BaseException:
+        except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):  # after another error, the recordings in progress are finished
+                for worker in set(multiprocessing.active_children()) - others:
+                    worker.terminate()
             raise
     return made
+
+
+def _make_in_worker(item: Item, folder: Path) -> Made:
+    """`make_item` in a worker, which ends after SIGTERM; the pool itself would give it the next item."""
+    try:
+        return make_item(item, folder)
+    except SystemExit:
+        os._exit(exit_status(signal.SIGTERM))
+
+
+def _begin_worker() -> None:
+    """SIGTERM ends a worker without a traceback, and what it has written of a recording is removed."""
+
+    def end(number: int, frame: Any) -> None:
+        raise SystemExit(exit_status(number))
+
+    end_with_parent()
+    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(exit_status(number)))
+    unblock_sigterm()  # one that came during the imports ends the worker here
+    signal.signal(signal.SIGTERM, end)
 
 
 def make_items(

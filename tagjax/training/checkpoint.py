@@ -19,6 +19,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
+from ..core.files import WriteError, make_folder, remove, writing
 from ..core.json_text import json_checksum
 from .processes import broadcast_arrays, broadcast_json, is_first
 from .state import HasStep
@@ -26,6 +27,9 @@ from .state import HasStep
 StateT = TypeVar("StateT", bound=HasStep)
 
 FORMAT = "tagjax training checkpoint 2"
+
+_UNFINISHED = ".orbax-checkpoint-tmp"
+"""How Orbax ends the name of a checkpoint's folder until it is finished."""
 
 
 class CheckpointError(ValueError):
@@ -51,7 +55,9 @@ class Checkpoints:
             raise CheckpointError(
                 f"No checkpoints at {self.folder}: no such folder. Give a run folder written by experiments.train."
             )
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
+        if create:  # a run that only reads may look at the folder of one that is writing a checkpoint
+            self._remove_unfinished()
         options = ocp.CheckpointManagerOptions(
             max_to_keep=keep,
             keep_period=keep_every,
@@ -80,7 +86,10 @@ class Checkpoints:
         return broadcast_json([] if self._manager is None else sorted(self._manager.all_steps()))
 
     def save(self, state: HasStep, data_state: Any) -> None:
-        """Write a checkpoint of the state at its step; `data_state` is plain JSON (the iterator's own state)."""
+        """Write a checkpoint of the state at its step; `data_state` is plain JSON (the iterator's own state).
+
+        Raises `WriteError` where the file system refuses to write; what was written of the checkpoint is removed.
+        """
         if self._manager is None:
             return
         step = int(state.step)
@@ -90,14 +99,24 @@ class Checkpoints:
         arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
         about = {"format": FORMAT, "step": step, "arrays": describe_arrays(state), "data": _jsonable(data_state)}
         about["sha256"] = json_checksum(about)
-        self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                arrays=ocp.args.StandardSave({f"{n:04d}": leaf for n, leaf in enumerate(arrays)}),
-                about=ocp.args.JsonSave(about),
-            ),
-        )
-        self._manager.wait_until_finished()
+        try:
+            with writing(self.folder / str(step)):
+                self._manager.save(
+                    step,
+                    args=ocp.args.Composite(
+                        arrays=ocp.args.StandardSave({f"{n:04d}": leaf for n, leaf in enumerate(arrays)}),
+                        about=ocp.args.JsonSave(about),
+                    ),
+                )
+                self._manager.wait_until_finished()
+        except WriteError:
+            self._remove_unfinished()
+            raise
+
+    def _remove_unfinished(self) -> None:
+        """Remove the parts of checkpoints that were not finished: of a killed process, or on a full disk."""
+        for unfinished in self.folder.glob(f"*{_UNFINISHED}"):
+            remove(unfinished)
 
     def restore(self, like: StateT, step: int | None = None) -> tuple[StateT, Any]:
         """The state at `step` (the newest if None) and the data iterator's state.

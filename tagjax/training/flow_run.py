@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ..core.build import build
+from ..core.folder_lock import locked_folder
+from ..core.interruption import interruption
 from ..core.machine import machine
 from ..core.results import write_json
 from ..flow.augmentation import AugmentationSettings
@@ -56,18 +59,35 @@ def initial_network(settings: Mapping[str, Any], weights: str | None) -> Abstrac
     return network if weights is None else load_weights(network, weights)
 
 
-def run_flow_training(config: TrainFlowConfig, folder: Path, *, console: Console | None = None) -> float:
-    """Train as configured and return the mean end-point error on synthetic validation pairs, pixels; NaN if interrupted.
+def run_flow_training(
+    config: TrainFlowConfig,
+    folder: Path,
+    *,
+    console: Console | None = None,
+    on_start: Callable[[], None] | None = None,
+) -> float:
+    """Train as configured and return the mean end-point error on synthetic validation pairs, pixels.
 
-    `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.safetensors, which `data.clips.flow=<path>` uses. An
-    interrupted run resumes from its newest checkpoint when started again in the same folder. With several processes
-    (`config.distributed`) only process 0 writes.
+    `folder` then holds checkpoints, metrics.jsonl, metrics.json and weights.safetensors, which `data.clips.flow=<path>` uses.
+    Ctrl-C and SIGTERM make it write a checkpoint and these files, and raise `KeyboardInterrupt` or `Terminated`; the run
+    resumes when it is started again in the same folder. With several processes (`config.distributed`) only process 0 writes.
+    The process that writes holds the folder's lock from before `on_start`, which writes what the caller adds to the folder.
+    Raises `FolderLockedError` if another process holds it.
     """
-    with distributed_runtime(config.distributed):
-        return _run(config, folder, console or Console(quiet=not is_first(), markup=False))
+    with contextlib.ExitStack() as lock:
+        with distributed_runtime(config.distributed):
+            if is_first():
+                lock.enter_context(locked_folder(folder))
+                if on_start is not None:
+                    on_start()
+            score_px, stopped_by = _run(config, folder, console or Console(quiet=not is_first(), markup=False))
+        if stopped_by:
+            raise interruption(stopped_by)
+    return score_px
 
 
-def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
+def _run(config: TrainFlowConfig, folder: Path, console: Console) -> tuple[float, int]:
+    """The mean end-point error on validation pairs, pixels, and the signal that stopped the run or 0."""
     begun = time.perf_counter()
     network = initial_network(config.flow, config.weights)
     _check_sizes(network, config.data.variation, config.loss)
@@ -119,7 +139,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
         "machine": machine(),
     }
     if not is_first():
-        return float("nan") if trained.interrupted else errors_px["learned"]["all"]
+        return errors_px["learned"]["all"], trained.stopped_by
     write_json(folder / "metrics.json", summary)
     about = {
         "flow": dict(config.flow),
@@ -132,10 +152,9 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> float:
     if warped:
         values = ", ".join(f"{name} {levels:.2f}" for name, levels in warped.items())
         console.print(f"mean difference of the sequences' images after warping, grey levels of 255: {values}")
-    if trained.interrupted:
+    if trained.stopped_by:
         console.print(f"Stopped at step {steps}; resume with the same command and hydra.run.dir={folder}")
-        return float("nan")
-    return errors_px["learned"]["all"]
+    return errors_px["learned"]["all"], trained.stopped_by
 
 
 def _check_sizes(network: AbstractFlowNetwork, variation: AugmentationSettings, loss: FlowLossSettings) -> None:

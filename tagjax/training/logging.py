@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
-from ..core.files import write_atomic
+from ..core.files import make_folder, write_atomic, writing
 from .processes import is_first
 
 _FINISH_S = 600.0
@@ -37,13 +37,13 @@ class MetricsFile:
 
     def __init__(self, path: Path, *, resume_step: int = 0):
         self.path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         if path.exists():
             kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _line_step(line) <= resume_step]
             write_atomic(path, "".join(f"{line}\n" for line in kept))
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        with self.path.open("a", encoding="utf-8") as file:
+        with writing(self.path), self.path.open("a", encoding="utf-8") as file:
             # JSON has no NaN; null stands for it.
             finite = {
                 name: value if value == value and abs(value) != float("inf") else None for name, value in values.items()

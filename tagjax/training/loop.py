@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .checkpoint import CheckpointError, Checkpoints
 from .logging import Logger
-from .processes import any_process, is_first, local_batch_size
+from .processes import is_first, local_batch_size, max_over_processes
 from .state import HasStep
 
 StateT = TypeVar("StateT", bound=HasStep)
@@ -62,31 +62,33 @@ class DivergedError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class TrainingResult(Generic[StateT]):
-    """The last state of a call of `train`, and whether it was interrupted."""
+    """The last state of a call of `train`, and the signal that stopped it: SIGINT (Ctrl-C), SIGTERM, or 0."""
 
     state: StateT
-    interrupted: bool
+    stopped_by: int = 0
 
 
 @contextmanager
-def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turns Ctrl-C and SIGTERM into a flag, so that the step in progress is finished; a second Ctrl-C stops at once.
+def _stop_on_signals() -> Iterator[Callable[[], int]]:
+    """Turns Ctrl-C and SIGTERM into a number, 0 before either, so that the step in progress is finished.
 
-    Schedulers send SIGTERM before they kill a job, sometimes repeatedly; it never stops at once.
+    A second Ctrl-C stops at once. Schedulers send SIGTERM before they kill a job, sometimes repeatedly; it never stops at
+    once.
     """
-    stop_requested = threading.Event()
+    received = 0
     if threading.current_thread() is not threading.main_thread():
-        yield stop_requested.is_set
+        yield lambda: 0
         return
 
     def handler(number: int, frame: Any) -> None:
-        if stop_requested.is_set() and number == signal.SIGINT:
+        nonlocal received
+        if received and number == signal.SIGINT:
             raise KeyboardInterrupt
-        stop_requested.set()
+        received = max(received, number)
 
     before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield stop_requested.is_set
+        yield lambda: received
     finally:
         for number, earlier in before.items():
             # None: the handler was not set by Python (but by JAX's distributed runtime) and cannot be restored.
@@ -147,10 +149,10 @@ def train(
     first_step, skipped, batch_size = int(state.step), 0, local_batch_size(settings.batch_size)
     done = first_step
     quiet = not settings.progress or not is_first()
-    with _stop_on_interrupt() as stop_requested, Progress(*columns, disable=quiet) as progress:
+    with _stop_on_signals() as received, Progress(*columns, disable=quiet) as progress:
         task = progress.add_task("train", total=settings.num_steps, completed=done, numbers="compiling")
-        stopping = any_process(stop_requested())
-        while done < settings.num_steps and not stopping:
+        stopped_by = max_over_processes(received())
+        while done < settings.num_steps and not stopped_by:
             place = samples.get_state()
             try:
                 batch = [next(samples) for _ in range(batch_size)]
@@ -179,11 +181,11 @@ def train(
                 after_step(state)
             text = "  ".join(f"{name} {numbers[name]:.3f}" for name in displayed if name in numbers)
             progress.update(task, completed=done, numbers=text)
-            stopping = any_process(stop_requested())
-        if stopping:
+            stopped_by = max_over_processes(received())
+        if stopped_by:
             jax.block_until_ready(state.step)
             checkpoints.save(state, samples.get_state())
-    return TrainingResult(state, done < settings.num_steps)
+    return TrainingResult(state, stopped_by)
 
 
 def _diverged(checkpoints: Checkpoints, done: int, skipped: int) -> str:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -59,6 +61,7 @@ def distributed_runtime(settings: DistributedSettings) -> Iterator[None]:
     if not settings.automatic and settings.num_processes == 1:
         yield
         return
+    handler = signal.getsignal(signal.SIGTERM) or signal.SIG_DFL
     if settings.automatic:
         try:
             jax.distributed.initialize(initialization_timeout=settings.timeout_s)
@@ -75,6 +78,8 @@ def distributed_runtime(settings: DistributedSettings) -> Iterator[None]:
             settings.process_id,
             initialization_timeout=settings.timeout_s,
         )
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)  # JAX's own handler only sets a flag, and the process would not end
     yield
     jax.distributed.shutdown()
 
@@ -103,11 +108,11 @@ def mean_over_processes(tree: T) -> T:
     return eqx.combine(mean, static)
 
 
-def any_process(flag: bool) -> bool:
-    """Whether the flag is set in any process."""
+def max_over_processes(number: int) -> int:
+    """The greatest of the processes' numbers."""
     if jax.process_count() == 1:
-        return flag
-    return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
+        return number
+    return int(np.max(multihost_utils.process_allgather(np.asarray(number, np.int32))))
 
 
 def broadcast_arrays(tree: T) -> T:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 import optax
 from rich.console import Console
 
+from ..core.folder_lock import locked_folder
+from ..core.interruption import interruption
 from ..core.results import to_json_values, write_json
 from ..recording import Recording
 from ..report.report import score_table
@@ -65,30 +68,52 @@ def evaluation_flow(model: AbstractTracer | JointModel, config: TrainConfig, pat
     return config.data.clips.flow
 
 
-def run_training(config: TrainConfig, folder: Path, *, console: Console | None = None) -> float:
+def run_training(
+    config: TrainConfig,
+    folder: Path,
+    *,
+    console: Console | None = None,
+    on_start: Callable[[], None] | None = None,
+) -> float:
     """Train as configured, evaluate on the validation recordings, and return the objective of a sweep, to be maximised.
 
     The objective is the mean box IoU on the validation recordings if they are labelled, else the coherence of their reads
     with the masks' motion; NaN without validation recordings. `folder` then holds checkpoints, metrics.jsonl, the learned
     parameters (weights.json, parameters.json, flow.safetensors), and with validation recordings metrics.json and report/.
-    An interrupted run writes a checkpoint, returns NaN, and resumes when started again in the same folder. With several
-    processes (`config.distributed`) process 0 writes and evaluates; the others return NaN.
+    Ctrl-C and SIGTERM make it write a checkpoint and raise `KeyboardInterrupt` or `Terminated`; the run resumes when it is
+    started again in the same folder. With several processes (`config.distributed`) process 0 writes and evaluates; the
+    others return NaN. The process that writes holds the folder's lock from before `on_start`, which writes what the caller
+    adds to the folder. Raises `FolderLockedError` if another process holds it.
     """
-    console = console or Console(markup=False)
+    with contextlib.ExitStack() as lock:
+        return _run(config, folder, console or Console(markup=False), on_start, lock)
+
+
+def _run(
+    config: TrainConfig,
+    folder: Path,
+    console: Console,
+    on_start: Callable[[], None] | None,
+    lock: contextlib.ExitStack,
+) -> float:
     with distributed_runtime(config.distributed):  # before JAX's devices are used for the first time
         smoothing_tracers({"learned": make_tracer(config.tracer)}, config.scores)
-        console.quiet = console.quiet or not is_first()
+        first = is_first()
+        console.quiet = console.quiet or not first
+        if first:
+            lock.enter_context(locked_folder(folder))
+            if on_start is not None:
+                on_start()
         training, validation = training_recordings(config.data)
         _describe(console, training, validation)
         trained, logger = _train(config, folder, training, validation, console)
-        first = is_first()
     try:
-        if not first:
-            return float("nan")
-        if trained.interrupted:
+        if trained.stopped_by:
             console.print(
                 f"Stopped at step {int(trained.state.step)}; resume with the same command and hydra.run.dir={folder}"
             )
+            raise interruption(trained.stopped_by)
+        if not first:
             return float("nan")
         tracers, flows = _save_learned(config, folder, trained.state)
         if not validation:

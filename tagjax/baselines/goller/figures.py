@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
 from matplotlib.axes import Axes
 
-from ...report.figure import blank
+from ...recording.image_files import write_image
+from ...report.figure import blank, save_figure
 from .alarm import Roc
 from .antennas import AntennaModel, response_db
 from .experiment.handover import Handover, mean_curve
@@ -73,7 +74,7 @@ def antenna_plot(path: Path, statistic: GridStatistic, model: AntennaModel) -> N
     grid[0, 0].set_ylabel("y (m)")
     grid[1, 0].set_ylabel("RSSI (dBm)")
     grid[1, 0].legend(fontsize=7, loc="upper right")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def roc_plot(path: Path, curves: Mapping[str, Roc], chosen: Mapping[str, tuple[float, float]]) -> None:
@@ -95,7 +96,7 @@ def roc_plot(path: Path, curves: Mapping[str, Roc], chosen: Mapping[str, tuple[f
     axes.set(xlabel="false alarms of still tags, P_FA", ylabel="detection, P_D", xlim=(-0.02, 1.02), ylim=(-0.02, 1.04))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize=8)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def association_plot(
@@ -136,7 +137,7 @@ def association_plot(
     lower.set(xlabel="time (s)", ylabel="tag's x (m)")
     for axes in (upper, lower):
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def handover_plot(path: Path, found: Sequence[Handover]) -> None:
@@ -155,7 +156,7 @@ def handover_plot(path: Path, found: Sequence[Handover]) -> None:
     axes.set(xlabel="time from the hand-over (s)", ylabel="association probability", ylim=(-0.02, 1.05), title=title)
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def scene_picture(
@@ -179,4 +180,4 @@ def scene_picture(
                 canvas, text, (max(x0, 2), max(y0 - 6, 14)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA
             )
         out.append(canvas)
-    cv2.imwrite(str(path), np.concatenate(out, axis=1)[..., ::-1])
+    write_image(path, np.concatenate(out, axis=1))

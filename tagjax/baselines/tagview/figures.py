@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Shaped
 from matplotlib.axes import Axes
 
-from ...report.figure import blank
+from ...report.figure import blank, save_figure
 from ..boxes import box_centre_px
 from .experiment.scoring import RecordingScore
 
@@ -29,7 +29,7 @@ def pair_plot(path: Path, scores: Sequence[RecordingScore]) -> None:
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
     both[1].set_ylim(-3, 4)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> None:
@@ -49,7 +49,7 @@ def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> No
     axes.set(xlabel="tags", ylabel="identification accuracy", ylim=(-0.02, 1.05))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def track_plot(
@@ -68,4 +68,4 @@ def track_plot(
     axes.scatter(found[:, 0], found[:, 1], s=28, linewidths=0.9, marker="o", facecolors="none", edgecolors="lime")
     axes.set(title=f"{name}: truth +, traces o")
     axes.set_axis_off()
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)

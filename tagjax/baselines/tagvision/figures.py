@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from ...report.figure import blank
+from ...report.figure import blank, save_figure
 
 
 def line_plot(
@@ -33,7 +33,7 @@ def line_plot(
     grid[0].legend(loc="upper right", fontsize=7)
     for axes in grid[len(panels) :]:
         axes.set_visible(False)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def matching_plot(path: Path, matched: Mapping[str, Mapping[float, float]], *, target: float = 0.98) -> None:
@@ -46,7 +46,7 @@ def matching_plot(path: Path, matched: Mapping[str, Mapping[float, float]], *, t
     axes.set(xlabel="observed for (s)", ylabel="tags matched to the right object", ylim=(0, 1.03))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def error_plot(
@@ -68,4 +68,4 @@ def error_plot(
     axes.set(xlabel="error (mm)", ylabel="fraction of frames", xlim=(0, 1.3 * limit), ylim=(0, 1.01))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, loc="lower right")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ...recording.image_files import write_image
 from .board_drawing import LocatedBoard, draw_boards
 from .calibration import Board, CalibrationError, CameraCalibration, calibrate, camera_pose, find_corners
 from .plane import PlaneCamera, save_calibration
@@ -216,6 +217,5 @@ def write_corners(found: FolderCalibration, path: str | Path) -> Path:
     path = Path(path)
     beside = path.with_name(f"{path.stem}_corners.png")
     sheet = draw_boards([(board, read_picture(board.picture)) for board in found.boards])
-    if not cv2.imwrite(str(beside), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
-        raise CalibrationError(f"{beside}: cannot be written.")
+    write_image(beside, sheet)
     return beside

@@ -81,7 +81,6 @@ class Tracing:
         kept = _stored(path, follows_from)
         if kept is None:
             kept = RecordingScores.of(self.trace(item.path(inputs.recordings)))
-            path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, {"follows_from": follows_from, "scores": dataclasses.asdict(kept)})
         return kept
 

@@ -96,7 +96,6 @@ def _estimate(measure: str, scores: Sequence[RecordingScores]) -> dict[str, Any]
 
 def write_table(path: Path, table: Mapping[str, Any]) -> None:
     """Write a table atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, table)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...report.figure import blank
+from ...report.figure import blank, save_figure
 
 if TYPE_CHECKING:
     from .real_tags import Association
@@ -33,7 +33,7 @@ def accuracy_plot(path: Path, rows: Sequence[Mapping[str, Any]], methods: Sequen
     if names:
         figure.axes[0].set_ylabel("carrier has the highest score")
         figure.axes[0].legend(fontsize=7, loc="lower right")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def speeds_plot(path: Path, associations: Sequence[Association]) -> None:
@@ -59,4 +59,4 @@ def speeds_plot(path: Path, associations: Sequence[Association]) -> None:
         axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3)
     if associations:
         figure.axes[-1].set_xlabel("time (s)")
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
