@@ -56,7 +56,7 @@ def test_only_the_mean_of_a_steps_errors_adds_up():
     assert np.std(ends) < 0.75 * np.std(chains)
 
 
-def test_an_unheard_tag_stays_and_its_belief_spreads():
+def test_an_unread_tag_stays_and_its_belief_spreads():
     anchor = Anchor(jnp.arange(5.0), jnp.log(jnp.full(NUM_BINS, 1e-9).at[30].set(1.0)))
     drift = lost_drift_m(jnp.asarray([0.0, 0.1, 0.2, 0.3, 0.4]))
     moved = move_anchor(anchor, jnp.full(WINDOW, 7.0), jnp.asarray(False), drift)
@@ -71,14 +71,14 @@ def test_an_unheard_tag_stays_and_its_belief_spreads():
 def test_votes_are_the_best_evidence_at_that_range():
     anchor = Anchor(jnp.full(WINDOW, 0.4), _fresh().belief)
     range_m, evidence = jnp.asarray([2.45, 3.45, 4.95]), jnp.asarray([1.0, -2.0, 3.0])
-    said = np.asarray(votes(anchor, range_m, evidence, jnp.asarray([True, True, False]), WIDTH, UNSEEN))
+    found = np.asarray(votes(anchor, range_m, evidence, jnp.asarray([True, True, False]), WIDTH, UNSEEN))
     start = (np.arange(NUM_BINS) + 0.5) * BIN_M
     at = {value: int(np.argmin(np.abs(start - value))) for value in (2.05, 3.05, 4.55, 5.5)}
     # Soft maxima lie above the hard ones by at most log(candidates) / sharpness.
-    assert said[at[2.05]] == pytest.approx(1.0, abs=0.05)
+    assert found[at[2.05]] == pytest.approx(1.0, abs=0.05)
     for elsewhere in (3.05, 4.55, 5.5):
-        assert said[at[elsewhere]] == pytest.approx(-1.0, abs=0.05)
-    assert int(said.argmax()) == at[2.05]
+        assert found[at[elsewhere]] == pytest.approx(-1.0, abs=0.05)
+    assert int(found.argmax()) == at[2.05]
 
 
 def test_the_belief_finds_the_starting_range_among_others():
@@ -106,19 +106,19 @@ def test_the_belief_finds_the_starting_range_among_others():
     assert float(density[2]) > 1.0
 
 
-def test_knowing_nothing_says_nothing():
-    said = log_density(_fresh(), jnp.linspace(0.0, 9.0, 50)[None], WIDTH, jnp.asarray(4.0))
-    np.testing.assert_allclose(said, 0.0, atol=1e-4)
+def test_without_information_the_likelihood_is_flat():
+    found = log_density(_fresh(), jnp.linspace(0.0, 9.0, 50)[None], WIDTH, jnp.asarray(4.0))
+    np.testing.assert_allclose(found, 0.0, atol=1e-4)
 
 
 def test_the_density_is_bounded_and_continuous():
     belief = jax.nn.log_softmax(jnp.zeros(NUM_BINS).at[20].set(40.0))
     anchor = Anchor(jnp.zeros(WINDOW), belief)
-    said = np.asarray(log_density(anchor, jnp.linspace(-1.0, 9.0, 2001)[None], WIDTH, jnp.asarray(4.0)))[0]
-    assert said.max() <= 4.0
-    assert said.min() >= -4.0
-    assert np.abs(np.diff(said)).max() < 0.2
-    assert np.linspace(-1.0, 9.0, 2001)[said.argmax()] == pytest.approx(20.5 * BIN_M, abs=BIN_M)
+    found = np.asarray(log_density(anchor, jnp.linspace(-1.0, 9.0, 2001)[None], WIDTH, jnp.asarray(4.0)))[0]
+    assert found.max() <= 4.0
+    assert found.min() >= -4.0
+    assert np.abs(np.diff(found)).max() < 0.2
+    assert np.linspace(-1.0, 9.0, 2001)[found.argmax()] == pytest.approx(20.5 * BIN_M, abs=BIN_M)
 
 
 def _normal(mean_m: float, std_m: float) -> jax.Array:

@@ -121,10 +121,10 @@ def test_a_second_maker_waits_and_goes_on_where_the_first_was_killed(
     with start_maker(target) as first:
         second = threading.Thread(target=lambda: found.append(cached_array(target, make(begun))))
         second.start()
-        said = ""
-        while "another process computes a.zarr" not in said:
+        result = ""
+        while "another process computes a.zarr" not in result:
             time.sleep(0.01)
-            said += capfd.readouterr().err
+            result += capfd.readouterr().err
         time.sleep(0.2)
         assert second.is_alive()
         assert not begun

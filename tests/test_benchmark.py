@@ -10,13 +10,13 @@ from tagjax.core.settings import ConfigError, from_mapping
 
 
 def test_cases_give_times_of_both_and_their_ratio():
-    told: list[str] = []
+    result: list[str] = []
     settings = BenchmarkSettings(cases=("gather", "coherence"), height=48, width=64, repeats=2)
-    running = run_benchmark(settings, on_case=told.append)
+    running = run_benchmark(settings, on_case=result.append)
     timings = [next(running)]
-    assert told == ["gather"]  # each figure comes when it is found
+    assert result == ["gather"]  # each figure comes when it is found
     timings += running
-    assert told == ["gather", "coherence"]
+    assert result == ["gather", "coherence"]
     for timing in timings:
         assert timing.ours_ms > 0
         assert timing.peer_ms > 0

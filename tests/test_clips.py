@@ -115,7 +115,7 @@ def _of_antenna(clip, place: int):
     )
 
 
-def test_a_named_antenna_is_obeyed(recording: Recording) -> None:
+def test_a_given_antenna_is_used(recording: Recording) -> None:
     both = _two_antennas(recording, 0.9)
     with pytest.warns(RecordingWarning, match=rf"{recording.reads.num_reads} of .* to antenna 2\."):
         clip = load_clip(both, 4, 20, antennas=(2,), **SMALL)
@@ -135,9 +135,9 @@ def test_an_antenna_without_place_or_reads_is_refused(recording: Recording, ante
         load_clip(both, 0, 6, antennas=(1, antenna), **SMALL)
 
 
-@pytest.mark.parametrize(("antennas", "said"), [((), ""), ((1, 1), "1, 1")])
-def test_no_antenna_and_one_twice_are_refused(recording: Recording, antennas: tuple[int, ...], said: str) -> None:
-    with pytest.raises(RecordingError, match=rf"found antennas=\[{said}\]; .*each once"):
+@pytest.mark.parametrize(("antennas", "result"), [((), ""), ((1, 1), "1, 1")])
+def test_no_antenna_and_one_twice_are_refused(recording: Recording, antennas: tuple[int, ...], result: str) -> None:
+    with pytest.raises(RecordingError, match=rf"found antennas=\[{result}\]; .*each once"):
         load_clip(_two_antennas(recording, 0.5), 0, 6, antennas=antennas, **SMALL)
 
 
@@ -151,7 +151,7 @@ def test_antennas_without_place_are_passed_over(recording: Recording) -> None:
         assert choose_antennas(dataclasses.replace(both, reads=swapped, antennas_m=ANTENNAS_M[:1]), ["tag-a"]) == (1,)
 
 
-def test_one_antenna_serves_all_tags_and_says_whom_it_does_not_read(recording: Recording) -> None:
+def test_one_antenna_serves_all_tags_and_unread_tags_are_reported(recording: Recording) -> None:
     both = _two_antennas(recording, 1.0)
     apart = (both.reads.epc == "tag-b") == (both.reads.antenna == 2)  # tag-a by antenna 1 only, tag-b by antenna 2
     split = both.with_reads(both.reads[apart][:-20])  # as many reads of both: the first antenna

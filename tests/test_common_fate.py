@@ -32,7 +32,7 @@ def _two_parts(rng, dtype=np.float32):
     return shift.astype(dtype), np.full((4, 6), 16.0, dtype), np.full((4, 6), 3.0, dtype)
 
 
-def test_the_shared_way_is_that_of_most_not_the_mean():
+def test_the_common_motion_is_that_of_the_majority_not_the_mean():
     shift, known, _ = _two_parts(np.random.default_rng(0))
     shared = shared_shift(jnp.asarray(shift), jnp.asarray(known), jnp.asarray(SPREAD), jnp.asarray(SLACK))
     np.testing.assert_allclose(shared, shift[:, :4].mean(axis=(0, 1)), atol=1e-3)
@@ -43,13 +43,13 @@ def test_the_shared_way_is_that_of_most_not_the_mean():
 
 def test_evidence_is_the_log_of_the_attention_above_its_floor():
     shift, known, log_odds = _two_parts(np.random.default_rng(1))
-    told = np.asarray(_evidence(*map(jnp.asarray, (shift, known, log_odds))))
+    found = np.asarray(_evidence(*map(jnp.asarray, (shift, known, log_odds))))
     shared = shift[:, :4].mean(axis=(0, 1))
     variance = SPREAD**2 + SLACK**2 * np.sum(shared**2)
     attention = np.exp(-np.sum((shift - shared) ** 2, axis=-1) / (2 * variance))
-    np.testing.assert_allclose(told, np.log((attention + FLOOR) / (1 + FLOOR)), atol=0.02)
-    assert (told <= 0).all()
-    np.testing.assert_allclose(told[:, 4:], np.log(FLOOR / (1 + FLOOR)), atol=1e-3)
+    np.testing.assert_allclose(found, np.log((attention + FLOOR) / (1 + FLOOR)), atol=0.02)
+    assert (found <= 0).all()
+    np.testing.assert_allclose(found[:, 4:], np.log(FLOOR / (1 + FLOOR)), atol=1e-3)
     np.testing.assert_allclose(
         fate_attention(jnp.asarray(shift), jnp.asarray(THING, jnp.float32), jnp.asarray(SPREAD), jnp.asarray(SLACK)),
         np.exp(-np.sum((shift - THING) ** 2, -1) / (2 * (SPREAD**2 + SLACK**2 * np.sum(THING**2)))),
@@ -67,22 +67,22 @@ def test_no_direction_is_special():
     np.testing.assert_allclose(one, other, atol=1e-3)
 
 
-def test_the_best_segments_say_what_the_thing_is():
+def test_the_best_segments_form_the_object():
     """The arm is larger here; but the tag's radio speaks for the thing."""
     shift, known, log_odds = _two_parts(np.random.default_rng(3))
     log_odds[:, :2] += 6.0
     shift[:, 2:4] = shift[:, 4:]
-    told = np.asarray(_evidence(*map(jnp.asarray, (shift, known, log_odds))))
-    assert told[:, :2].min() > -0.1
-    assert told[:, 2:].max() < -3.0
+    found = np.asarray(_evidence(*map(jnp.asarray, (shift, known, log_odds))))
+    assert found[:, :2].min() > -0.1
+    assert found[:, 2:].max() < -3.0
 
 
 def test_what_is_not_known_is_not_judged():
     shift, known, log_odds = _two_parts(np.random.default_rng(4))
     known[1, 5], log_odds[1, 5] = 0.0, 50.0
-    told = np.asarray(_evidence(*map(jnp.asarray, (shift, known, log_odds))))
-    assert told[1, 5] == 0.0
-    assert told[0, 5] < -3.0
+    found = np.asarray(_evidence(*map(jnp.asarray, (shift, known, log_odds))))
+    assert found[1, 5] == 0.0
+    assert found[0, 5] < -3.0
     np.testing.assert_array_equal(
         _evidence(jnp.asarray(shift), jnp.zeros((4, 6)), jnp.asarray(log_odds)), np.zeros((4, 6))
     )

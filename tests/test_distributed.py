@@ -47,13 +47,13 @@ def _start(commands: list[list[str]]) -> list[subprocess.Popen]:
 def _finish(*commands: list[str]) -> list[str]:
     processes = _start(list(commands))
     try:
-        said = [process.communicate(timeout=550)[0] for process in processes]
+        found = [process.communicate(timeout=550)[0] for process in processes]
     finally:
         for process in processes:
             process.kill()
-    for process, text in zip(processes, said, strict=True):
+    for process, text in zip(processes, found, strict=True):
         assert process.returncode == 0, text[-3000:]
-    return said
+    return found
 
 
 def _rows(run: Path) -> list[dict]:
@@ -83,13 +83,13 @@ def test_two_processes_learn_tracing_as_one_does(recordings: list[str], tmp_path
     more = [f"data.validation=[{recordings[1]}]", "loop.validate_every=8", "scores.num_pictures=2"]
     one, first, second = (tmp_path / name for name in ("one", "first", "second"))
     _finish(_train(recordings[0], one, *more))
-    said = _finish(*(_train(recordings[0], run, *more) for run in (first, second)))
+    found = _finish(*(_train(recordings[0], run, *more) for run in (first, second)))
     _alike(one, first)
     assert (first / "report" / "frames.csv").is_file()
     assert (first / "metrics.json").is_file()
     assert {path.name for path in second.iterdir()} <= {"config.yaml", ".hydra", "train.log"}
-    assert "IoU" in said[0]
-    assert "IoU" not in said[1]
+    assert "IoU" in found[0]
+    assert "IoU" not in found[1]
 
 
 def test_two_processes_learn_flow_as_one_does(tmp_path: Path) -> None:

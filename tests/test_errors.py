@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("error", [ValueError("no such tag"), FileNotFoundError("no such tag"), OSError("no such tag")])
-def test_what_can_be_mended_is_said_errors_in_one_line(error: Exception) -> None:
+def test_errors_that_the_user_can_correct_take_one_line(error: Exception) -> None:
     with pytest.raises(SystemExit, match=r"^trace: no such tag$") as ended, errors_in_one_line("trace"):
         raise error
     assert ended.value.__cause__ is error

@@ -40,9 +40,9 @@ def test_pieces_and_groups_give_what_one_scan_gives(frames_at_once: int, tags_at
     settings = ScoreSettings(frames_at_once=frames_at_once, tags_at_once=tags_at_once)
     pieces = list(trace_recording(tracer, recording, synthetic.load, epcs=EPCS, settings=settings))
     assert [number for number, _ in pieces] == list(range(20))
-    for number, said in pieces:
+    for number, found in pieces:
         expected = jax.tree.map(lambda leaf, n=number: np.asarray(leaf[n]), whole)
-        for got, wanted in zip(jax.tree.leaves(said), jax.tree.leaves(expected), strict=True):
+        for got, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(got, wanted, rtol=2e-5, atol=2e-6)
 
 
@@ -50,15 +50,15 @@ def test_three_tags_in_groups_of_two_keep_their_order() -> None:
     recording = synthetic.recording(8)
     names = ["tag-b", "tag-a", "tag-b"]
     settings = ScoreSettings(tags_at_once=2)
-    _, said = list(trace_recording(synthetic.SmallTracer(), recording, synthetic.load, epcs=names, settings=settings))[
+    _, found = list(trace_recording(synthetic.SmallTracer(), recording, synthetic.load, epcs=names, settings=settings))[
         -1
     ]
-    assert said.mask.shape[0] == 3
-    np.testing.assert_allclose(said.mask[0], said.mask[2], rtol=1e-5)
-    assert np.abs(said.mask[0] - said.mask[1]).max() > 0.1
+    assert found.mask.shape[0] == 3
+    np.testing.assert_allclose(found.mask[0], found.mask[2], rtol=1e-5)
+    assert np.abs(found.mask[0] - found.mask[1]).max() > 0.1
 
 
-def test_a_group_is_filled_up_with_tags_that_are_never_heard() -> None:
+def test_a_group_is_filled_up_with_tags_that_are_never_read() -> None:
     """Not with one of its own once more, which would compete with itself."""
     frames = synthetic.load(synthetic.recording(8), 0, 8, epcs=["tag-b", "tag-a", "tag-b"]).frames
     last = _tags(frames, 2, 2)
@@ -69,7 +69,7 @@ def test_a_group_is_filled_up_with_tags_that_are_never_heard() -> None:
     assert not np.asarray(last.reads.valid[:, 1]).any()
 
 
-def test_the_object_is_found_named_and_outlined() -> None:
+def test_the_object_is_detected_identified_and_outlined() -> None:
     recording = synthetic.recording(40)
     result = evaluate_recording(synthetic.SmallTracer(), recording, synthetic.load, stride=1)
     scores = result.scores().result()
@@ -93,7 +93,7 @@ def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
     assert recording.truth is not None
     names = [*EPCS, "on-a-shelf"]
 
-    def said(claimed: bool) -> Trace:
+    def trace_of(claimed: bool) -> Trace:
         return Trace(
             mask=jnp.zeros((3, synthetic.HEIGHT, synthetic.WIDTH)),
             box_px=jnp.zeros((3, 4)),
@@ -104,7 +104,7 @@ def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
             detected=jnp.array([True, False, claimed]),
         )
 
-    traces = [(number, said(number in (3, 4, 9))) for number in range(12)]
+    traces = [(number, trace_of(number in (3, 4, 9))) for number in range(12)]
     result = score_traces(traces, recording, names)
     scores = result.scores().result()
     assert scores["false_detections"] == pytest.approx(3 / 12)
@@ -128,7 +128,7 @@ def test_without_truth_there_are_pictures_but_no_scores() -> None:
     assert summarise({"it": [result]})["it"]["all"]["num_frames"] == 0
 
 
-def test_bad_requests_say_what_is_wrong() -> None:
+def test_bad_requests_are_refused_with_the_reason() -> None:
     recording = synthetic.recording(12)
     with pytest.raises(RecordingError, match="never read"):
         evaluate_recording(synthetic.SmallTracer(), recording, synthetic.load, stride=1, epcs=["unknown"])
@@ -179,8 +179,8 @@ def test_what_is_thin_at_its_ends_is_boxed_whole() -> None:
 def _box_of_the_true_mask(labels: np.ndarray, stride: int) -> np.ndarray:
     mask = jnp.asarray(labels[::stride, ::stride] == 1, jnp.float32)[None]
     none = jnp.zeros((1, *mask.shape[1:]))
-    said = describe(mask, jnp.zeros((1, 3)), none, none[0] > 0, jnp.ones(1), TagAttention().box_tail)
-    return box_to_picture(np.asarray(said.box_px[0]), stride, *labels.shape)
+    found = describe(mask, jnp.zeros((1, 3)), none, none[0] > 0, jnp.ones(1), TagAttention().box_tail)
+    return box_to_picture(np.asarray(found.box_px[0]), stride, *labels.shape)
 
 
 def test_report_is_complete(tmp_path: Path) -> None:
@@ -222,8 +222,8 @@ def test_the_table_fits_a_terminal_of_eighty_columns() -> None:
     console = Console(width=80, record=True, quiet=False, file=io.StringIO())
     console.print(score_table(summary))
     shown = console.export_text()
-    for told in ("learned_smoothed", "0.642", "21.9", "0.000", "1065", "frames"):
-        assert told in shown
+    for found in ("learned_smoothed", "0.642", "21.9", "0.000", "1065", "frames"):
+        assert found in shown
 
 
 def test_plain_json_has_no_nan() -> None:

@@ -97,7 +97,7 @@ def test_results_are_a_table_with_failures_and_commands(tmp_path: Path, counted:
     [
         (
             {"kinds": ["tables", "nothing"]},
-            "expected different ones of clocks, names, targets, tables, real_tables, weights",
+            "expected different ones of clocks, names, targets, tables, real_tables, weights, kills",
         ),
         ({"kinds": ["tables", "tables"]}, "expected different ones"),
         ({"number": 0}, "expected at least 1 and 0"),

@@ -166,7 +166,7 @@ def test_classical_flows_take_tiny_grey_and_deep_pictures(name):
 
 @pytest.mark.parametrize("size", [1, 31, 32, 63, 64, 65, 424])
 @pytest.mark.parametrize("divisor", [8, 32, 64, 96])
-def test_padding_is_the_least_that_fits(size, divisor):
+def test_padding_is_the_smallest_that_fits(size, divisor):
     before, after = padding(size, divisor)
     whole = before + size + after
     assert whole % divisor == 0
@@ -285,20 +285,20 @@ def test_one_batch_of_both_ways_is_what_two_calls_are(monkeypatch):
     np.testing.assert_allclose(batch.backward_px, back, atol=1e-4)
 
 
-def test_a_failure_in_the_second_thread_is_told(monkeypatch):
+def test_a_failure_in_the_second_thread_is_raised(monkeypatch):
     network = small_network(gain=30.0)
     pictures = texture(64, 64, 1), texture(64, 64, 2)
     estimate(network, *pictures)
 
     def failing(network, picture):
         if threading.current_thread() is not threading.main_thread():
-            raise FloatingPointError("told")
+            raise FloatingPointError("found")
         return picture
 
     monkeypatch.setattr(tagjax.flow.estimates, "_encode", failing)
     key = next(key for key in tagjax.flow.estimates._compiled if key[2][-1] == ((64, 64, 3), jnp.uint8))
     tagjax.flow.estimates._compiled.add((failing, *key[1:]))
-    with pytest.raises(FloatingPointError, match="told"):
+    with pytest.raises(FloatingPointError, match="found"):
         estimate(network, *pictures)
 
 
@@ -338,16 +338,16 @@ def _same(one: Any, other: Any) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_weights_come_back_with_what_is_told_of_them(tmp_path):
+def test_weights_come_back_with_their_metadata(tmp_path):
     network, path = small_network(3), tmp_path / "new" / "a.safetensors"
     about = {"flow": SETTINGS, "recipe": {"seed": 3, "sizes": (1, 2)}, "epe_px": np.float32(0.5), "data": ["a"]}
     save_weights(path, network, about)
     _same(load_network(path), network)
     _same(load_weights(small_network(4), str(path)), network)
-    told = weights_metadata(path)
-    assert told["flow"] == SETTINGS
-    assert told["recipe"] == {"seed": 3, "sizes": [1, 2]}
-    assert told["epe_px"] == 0.5
+    found = weights_metadata(path)
+    assert found["flow"] == SETTINGS
+    assert found["recipe"] == {"seed": 3, "sizes": [1, 2]}
+    assert found["epe_px"] == 0.5
     again = tmp_path / "b.safetensors"
     save_weights(again, network, about)
     assert again.read_bytes() == path.read_bytes()
@@ -361,7 +361,7 @@ def test_weights_come_back_with_what_is_told_of_them(tmp_path):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
 
 
-def test_weights_that_say_something_else_than_they_are_are_not_written(tmp_path):
+def test_weights_with_metadata_of_another_network_are_not_written(tmp_path):
     path = tmp_path / "a.safetensors"
     for about, message in (
         ({}, "expected `flow`"),
@@ -441,7 +441,7 @@ def test_damaged_foreign_and_unfit_files_are_refused_in_words(tmp_path):
 def test_settings_of_a_file_name_nothing_but_networks(tmp_path):
     good, bad = tmp_path / "good.safetensors", tmp_path / "bad.safetensors"
     save_weights(good, small_network(), {"flow": SETTINGS})
-    told = weights_metadata(good)
+    found = weights_metadata(good)
     for target in (
         "os.system",
         "tagjax.flow.pyramid._Decoder",
@@ -453,7 +453,7 @@ def test_settings_of_a_file_name_nothing_but_networks(tmp_path):
         None,
     ):
         flow = {**SETTINGS, "_target_": target}
-        _rewritten(good, bad, metadata={**told, "flow": flow})
+        _rewritten(good, bad, metadata={**found, "flow": flow})
         with pytest.raises(ValueError, match="expected a network of tagjax"):
             load_network(bad)
     # Neither memory nor time is spent on a network that no file holds.
@@ -463,7 +463,7 @@ def test_settings_of_a_file_name_nothing_but_networks(tmp_path):
         {"medians": 10**400},
         {"radii": [2, float("inf")]},
     ):
-        _rewritten(good, bad, metadata={**told, "flow": {**SETTINGS, **changed}})
+        _rewritten(good, bad, metadata={**found, "flow": {**SETTINGS, **changed}})
         with pytest.raises(ValueError, match=f"{next(iter(changed))} too large; expected at most 1024"):
             load_network(bad)
 

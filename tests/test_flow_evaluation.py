@@ -82,7 +82,7 @@ def test_scores_of_pairs_merge_to_those_of_all_pixels():
     assert nothing["fl"] is None
 
 
-def test_a_flow_that_says_nothing_or_is_of_another_size_is_refused():
+def test_a_flow_that_is_not_finite_or_of_another_size_is_refused():
     truth = np.zeros((4, 5, 2), np.float32)
     flow = truth.copy()
     flow[1, 2, 0] = np.nan
@@ -277,9 +277,9 @@ def test_scores_before_a_case_that_fails_are_kept_and_called_unfinished(scenes, 
         flows=("zero", "dis"), num_pairs=2, pairs=SMALL, folders=(str(scenes),), num_panels=0, progress=False
     )
     folder = tmp_path / "report"
-    with pytest.raises(RecordingError, match=r"frame11\.png is missing") as told:
+    with pytest.raises(RecordingError, match=r"frame11\.png is missing") as found:
         evaluate_flows(settings, folder)
-    assert "unfinished.md" in told.value.__notes__[0]
+    assert "unfinished.md" in found.value.__notes__[0]
     assert not (folder / "metrics.json").exists()
     kept = json.loads((folder / "unfinished.json").read_text())
     assert kept["materials"]["drawn pairs"]["zero"]["all"]["num_pixels"] == 2 * 32 * 48
@@ -293,9 +293,9 @@ def test_scores_before_a_case_that_fails_are_kept_and_called_unfinished(scenes, 
     assert sorted(path.name for path in folder.iterdir()) == ["flow.md", "metrics.json"]
     for name in ("frame10.png", "flow10.flo"):
         (scenes / "moved" / name).write_bytes(b"")
-    with pytest.raises(RecordingError) as told:
+    with pytest.raises(RecordingError) as found:
         evaluate_flows(dataclasses.replace(settings, num_pairs=0), tmp_path / "nothing")
-    assert not hasattr(told.value, "__notes__")
+    assert not hasattr(found.value, "__notes__")
     assert not (tmp_path / "nothing").exists()
 
 

@@ -285,7 +285,7 @@ def test_occluded_is_what_the_square_covers():
     np.testing.assert_allclose(length, 36.0 * covered + 72.0 * (forward[..., 0] > 0), atol=1e-5)
 
 
-def test_hiding_begins_when_it_is_told_to_and_has_no_gradient():
+def test_hiding_begins_at_its_step_and_has_no_gradient():
     forward, backward, covered = (jnp.asarray(each) for each in _curtain())
     settings = FlowLossSettings()
     on, off = jnp.ones(()), jnp.zeros(())
@@ -383,7 +383,7 @@ def test_imitation_is_the_weighted_robust_distance_from_the_teachers_flow():
     )
 
 
-def test_where_the_teacher_says_nothing_nothing_is_asked():
+def test_pixels_without_the_teachers_flow_have_no_loss():
     whole = _uneven(8, 8, 2.0)
     teacher = whole.copy()
     teacher[:4] = np.nan

@@ -91,28 +91,28 @@ def test_grey_and_16_bit_pictures_become_rgb_of_8_bits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("broken", ["one", "sizes", "cut", "nothing", "ending"])
-def test_what_is_no_sequence_says_so(tmp_path: Path, broken: str) -> None:
+def test_what_is_no_sequence_is_refused(tmp_path: Path, broken: str) -> None:
     pictures = smooth_pictures(2, 40, 50)
     names = ["a.png", "b.png"]
     for name, picture in zip(names, pictures, strict=True):
         cv2.imwrite(str(tmp_path / name), picture)
-    path, told = str(tmp_path), ""
+    path, result = str(tmp_path), ""
     if broken == "one":
         (tmp_path / "b.png").unlink()
-        told = "holds 1 images"
+        result = "holds 1 images"
     elif broken == "sizes":
         cv2.imwrite(str(tmp_path / "b.png"), pictures[1][:30])
-        told = "50 x 30 pixels"
+        result = "50 x 30 pixels"
     elif broken == "cut":
         for name in names:
             (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:60])
-        told = r"none of 2 images can be read. First: .*a\.png: the image is truncated"
+        result = r"none of 2 images can be read. First: .*a\.png: the image is truncated"
     elif broken == "nothing":
-        path, told = str(tmp_path / "nowhere"), "found nothing"
+        path, result = str(tmp_path / "nowhere"), "found nothing"
     else:
         (tmp_path / "x.txt").write_text("?")
-        path, told = str(tmp_path / "x.txt"), "found a file"
-    with pytest.raises(RecordingError, match=told):
+        path, result = str(tmp_path / "x.txt"), "found a file"
+    with pytest.raises(RecordingError, match=result):
         open_sequence(path, tmp_path / "cache")[1]
 
 
@@ -126,7 +126,7 @@ def test_bad_pictures_of_a_folder_are_named_when_it_is_opened(tmp_path: Path) ->
         (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(
         RecordingError, match="4 of 20 images cannot be used; expected complete images of 50 x 40"
-    ) as told:
+    ) as found:
         open_sequence(str(tmp_path), tmp_path / "cache")
     for words in (
         "0.png: 50 x 30 pix",
@@ -134,7 +134,7 @@ def test_bad_pictures_of_a_folder_are_named_when_it_is_opened(tmp_path: Path) ->
         "11.jpg: the image is truncated",
         "19.png: no read",
     ):
-        assert words in str(told.value)
+        assert words in str(found.value)
     for number in range(20):
         cv2.imwrite(str(tmp_path / f"{number}.bmp"), pictures[0][:30])
     with pytest.raises(RecordingError, match=r"of 50 x 30 .* And 14 more\."):
@@ -191,7 +191,7 @@ class StatedCapture:
 
 
 @pytest.mark.parametrize("stated", [-1.4e17, 0.0, 3.0, 900.0, float("inf"), float("nan")])
-def test_video_is_read_to_its_end_whatever_it_says_of_its_length(
+def test_video_is_read_to_its_end_whatever_length_its_header_gives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: float
 ) -> None:
     write_video(tmp_path / "film.avi", smooth_pictures(5, 32, 48))
@@ -207,7 +207,7 @@ def test_video_of_one_frame_is_refused_and_not_kept(tmp_path: Path) -> None:
     assert not (tmp_path / "cache").exists() or not list((tmp_path / "cache").iterdir())
 
 
-def test_broken_video_says_so_and_leaves_nothing(tmp_path: Path) -> None:
+def test_broken_video_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "film.mp4").write_bytes(b"no video at all")
     with pytest.raises(RecordingError, match="cannot be decoded"):
         open_sequence(str(tmp_path / "film.mp4"), tmp_path / "cache")
@@ -438,14 +438,14 @@ def test_a_student_learns_what_the_teacher_says() -> None:
     samples[1]["flow_px"][:3] = np.nan
     optimizer, settings = optax.adam(3e-3), FlowLossSettings(robustness=0.7)
     state = FlowTrainState.create(small_network(), optimizer, seed=0)
-    told = []
+    found = []
     for _ in range(30):
         state, numbers = flow_step(state, samples, optimizer, settings, 10.0)
-        told.append(numbers)
-    assert set(told[0]) == {"distillation", "loss", "gradient_norm", "skipped"}
-    assert told[0]["loss"] == told[0]["distillation"]
-    assert told[-1]["loss"] < 0.8 * told[0]["loss"]
-    assert not any(numbers["skipped"] for numbers in told)
+        found.append(numbers)
+    assert set(found[0]) == {"distillation", "loss", "gradient_norm", "skipped"}
+    assert found[0]["loss"] == found[0]["distillation"]
+    assert found[-1]["loss"] < 0.8 * found[0]["loss"]
+    assert not any(numbers["skipped"] for numbers in found)
 
 
 @pytest.mark.parametrize(
@@ -633,7 +633,7 @@ def test_nothing_is_hidden_until_the_flow_has_begun_to_mean_something() -> None:
 
 
 @pytest.mark.ci
-def test_teacher_is_heard_late_and_then_ramped() -> None:
+def test_the_teachers_weight_begins_late_and_then_rises() -> None:
     settings = FlowLossSettings(
         census_radius=1, census_stride=1, self_supervision=1.0, self_supervision_after=10, self_supervision_ramp=10,
         self_supervision_border_px=8,
@@ -680,12 +680,12 @@ def test_run_ends_with_scores_beside_the_peers_and_weights(tmp_path: Path) -> No
     config = configured(tmp_path)
     config = dataclasses.replace(config, data=dataclasses.replace(config.data, sequences=(str(tmp_path / "walk"),)))
     score = run_flow_training(config, tmp_path / "run")
-    told = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert told["steps"] == 5
-    assert set(told["warped_levels"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
-    assert told["warped_levels"]["dis"] < 0.5 * told["warped_levels"]["zero"]
-    assert set(told["epe_px"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
-    np.testing.assert_allclose(score, told["epe_px"]["learned"]["all"])
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["steps"] == 5
+    assert set(found["warped_levels"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
+    assert found["warped_levels"]["dis"] < 0.5 * found["warped_levels"]["zero"]
+    assert set(found["epe_px"]) == {"learned", "zero", "dis_ultrafast", "dis_fast", "dis"}
+    np.testing.assert_allclose(score, found["epe_px"]["learned"]["all"])
     assert (tmp_path / "run" / "weights.safetensors").is_file()
 
 
@@ -757,10 +757,10 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path) -> None:
         odd = configured(tmp_path, data={"variation": {"height": 32, "width": 32, name: value}})
         with pytest.raises(ValueError, match=f"variation.{name} is {value}; this network needs multiples of 8"):
             run_flow_training(odd, tmp_path / "run")
-    for border, size, told in ((6, 32, "leaves 20 pixels"), (16, 32, "leaves 0 pixels")):
+    for border, size, result in ((6, 32, "leaves 20 pixels"), (16, 32, "leaves 0 pixels")):
         cut = {"loss": {"self_supervision": 0.3, "self_supervision_border_px": border}}
         odd = configured(tmp_path, data={"variation": {"height": size, "width": size}}, **cut)
-        with pytest.raises(ValueError, match=f"{told} of data.variation.height.*set a multiple of 4"):
+        with pytest.raises(ValueError, match=f"{result} of data.variation.height.*set a multiple of 4"):
             run_flow_training(odd, tmp_path / "run")
     with pytest.raises(ConfigError, match="self_supervision_border_px is 0"):
         configured(tmp_path, loss={"self_supervision_border_px": 0})

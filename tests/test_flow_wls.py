@@ -63,7 +63,7 @@ def pair():
     return pictures, np.asarray(drawn.forward_px), np.asarray(drawn.occluded_first)
 
 
-def test_a_named_flow_is_smoothed_both_ways_alone_along_a_video_and_with_what_is_hidden(pair) -> None:
+def test_a_flow_by_name_is_smoothed_in_both_directions(pair) -> None:
     (first, second), truth, hidden = pair
     plain, smoothed = make_flow("dis"), make_flow("dis+wls")
     (ahead, back), (again, _) = flow_along(smoothed, iter([first, second, first]))

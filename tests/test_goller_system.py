@@ -133,7 +133,7 @@ def test_another_number_of_antennas_is_refused(shop, calibration):
 
 
 @pytest.mark.ci
-def test_the_tracer_says_what_the_whole_recording_says(shop, calibration):
+def test_the_tracer_agrees_with_the_whole_recording(shop, calibration):
     tracer = GollerTracer(calibration, scenes.LOOKING_DOWN).install(shop)
     traces = list(host_trace(tracer, shop))
     observed = observe(shop, scenes.LOOKING_DOWN)

@@ -51,9 +51,9 @@ def _panning_network(seed: int = 1) -> PyramidFlow:
     network = small_network(seed)
     biases = lambda n: [decoder.head.bias for decoder in n.decoders]  # noqa: E731
     # In pixels of the levels, 1/4 and 1/8 of the picture's; the rougher one's flow is enlarged and then added to.
-    told = [jnp.asarray([0.1 * PAN_PX, 0.02]), jnp.asarray([0.075 * PAN_PX, -0.01])]
+    found = [jnp.asarray([0.1 * PAN_PX, 0.02]), jnp.asarray([0.075 * PAN_PX, -0.01])]
     assert [bias.shape for bias in biases(network)] == [(2,), (2,)]
-    return eqx.tree_at(biases, network, told)
+    return eqx.tree_at(biases, network, found)
 
 
 @pytest.fixture(scope="module")

@@ -92,9 +92,9 @@ def test_what_did_not_move_in_learning_may_be_asked_for(weights: str) -> None:
     without, with_doubt = (make_tracer(one, weights) for one in (plain, doubting))
     assert isinstance(without, TagAttention)
     assert isinstance(with_doubt, TagAttention)
-    told = with_doubt.physical()
-    assert told.pop("rest_doubt") == pytest.approx(0.2)
-    assert told == {name: value for name, value in without.physical().items() if name != "rest_doubt"}
+    result = with_doubt.physical()
+    assert result.pop("rest_doubt") == pytest.approx(0.2)
+    assert result == {name: value for name, value in without.physical().items() if name != "rest_doubt"}
     with pytest.raises(ValueError, match=r"things_in_hand\.json: found tracer\.rest_doubt=0\.2; expected 0\.0"):
         make_tracer(doubting, "things_in_hand")  # which learned it
 
@@ -129,7 +129,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         load_parameters(tracer, "nowhere", SETTINGS)
 
 
-def test_a_tracer_without_learned_parameters_says_so() -> None:
+def test_a_tracer_without_learned_parameters_is_refused() -> None:
     with pytest.raises(ValueError, match="learned parameters are of TagAttention"):
         make_tracer({"_target_": "tagjax.tagattention.paper.TagAttentionPaper"}, "default")
 
@@ -143,10 +143,10 @@ def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:
         make_tracer(composed["tracer"], weights) for weights in (None, "default", *packaged_parameters())
     )
     assert all(isinstance(one, TagAttention) for one in (untrained, default, people, things))
-    told = [one.physical() for one in (untrained, default, things) if isinstance(one, TagAttention)]
-    assert told[0] != told[1] != told[2] != told[0]
+    found = [one.physical() for one in (untrained, default, things) if isinstance(one, TagAttention)]
+    assert found[0] != found[1] != found[2] != found[0]
     assert isinstance(people, TagAttention)
-    assert people.physical() == told[1]
+    assert people.physical() == found[1]
 
 
 def _tracer_settings(name: str) -> dict[str, Any]:

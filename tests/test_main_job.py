@@ -120,7 +120,7 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
     assert set(json.loads((tmp_path / "parameters.json").read_text())) == {"learned", "untrained", "paper"}
 
 
-def test_what_a_run_says_of_itself_is_not_given_again() -> None:
+def test_settings_stored_with_a_run_need_not_be_given_again() -> None:
     for more in ({"tracer": {"_target_": "tagjax.tagattention.TagAttention"}}, {"weights": "default"}):
         with pytest.raises(ConfigError, match="expected one of them, because a run has its own tracer"):
             from_mapping(EvaluateConfig, {"run": "runs/1", **more})
@@ -251,7 +251,7 @@ def test_reads_of_unlike_conventions_are_not_joined() -> None:
     assert len(join_reads([timed, timed[:3]]).reader_time_ns) == one.num_reads + 3
 
 
-def test_a_tracer_of_one_antenna_gets_the_named_one_and_of_several_the_busiest() -> None:
+def test_a_tracer_of_one_antenna_gets_the_given_one_or_else_the_busiest() -> None:
     one, several = TagAttentionPaper(), TagAttention()
     assert [antennas_for(one, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), None, None]
     assert [antennas_for(several, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), (1, 2), "all"]

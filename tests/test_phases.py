@@ -53,8 +53,8 @@ def _follow(reads: PhaseReads, path, num_frames: int, noise: PhaseNoise, doubled
         buffer = jax.tree.map(lambda leaf, until=until: np.roll(leaf, -until), reads)  # ends with the newest
         fresh = FRESH(buffer, channel, since, now)
         step = jnp.asarray(path(FRAME_S * (i + 1)) - path(FRAME_S * i), dtype)
-        told, phasor = COMPILED(phasor, step, fresh, noise, doubled_angle=doubled_angle)
-        total, channel = total + float(told), fresh.channel
+        found, phasor = COMPILED(phasor, step, fresh, noise, doubled_angle=doubled_angle)
+        total, channel = total + float(found), fresh.channel
     return total, phasor, channel
 
 
@@ -146,9 +146,9 @@ def test_a_read_costs_no_more_than_the_share_of_outliers_and_leaves_the_phasor()
     bent = PhaseReads(reads.time_s, wrong, reads.carrier_hz, reads.sigma_rad, reads.channel, reads.valid)
     noise = _noise(outlier=0.05)
     clean, phasor, _ = _follow(reads, lambda t: 2.0, 8, noise)
-    told, after, _ = _follow(bent, lambda t: 2.0, 8, noise)
+    found, after, _ = _follow(bent, lambda t: 2.0, 8, noise)
     one_read = clean / 12
-    assert clean - told < 1.5 * one_read - np.log(0.05)
+    assert clean - found < 1.5 * one_read - np.log(0.05)
     assert float(jnp.hypot(*after.total)) == pytest.approx(12 / 13 * float(jnp.hypot(*phasor.total)), rel=0.02)
 
 
@@ -161,13 +161,13 @@ def test_slack_forgives_a_share_of_the_motion_and_nothing_at_rest():
     assert _follow(resting, lambda t: 2.0, 8, slack)[0] == pytest.approx(_follow(resting, lambda t: 2.0, 8, tight)[0])
 
 
-def test_without_reads_nothing_is_said_and_the_phasor_turns_with_the_thing():
+def test_without_reads_there_is_no_evidence_and_the_phasor_turns_with_the_object():
     reads = _reads([0.01, 0.02, 0.03], [2.0, 2.0, 2.0], [0, 0, 0])
     fresh = fresh_reads(reads, NO_CHANNEL, jnp.asarray(0.0), jnp.asarray(FRAME_S))
     _, phasor = explain(Phasor.nothing(()), jnp.asarray(0.0), fresh, _noise(), doubled_angle=False)
     silent = fresh_reads(reads, fresh.channel, jnp.asarray(FRAME_S), jnp.asarray(2 * FRAME_S))
-    told, after = explain(phasor, jnp.asarray(0.01), silent, _noise(), doubled_angle=False)
-    assert float(told) == 0.0
+    found, after = explain(phasor, jnp.asarray(0.01), silent, _noise(), doubled_angle=False)
+    assert float(found) == 0.0
     assert int(silent.channel) == 0
     before, now = (float(jnp.arctan2(*one.total[::-1])) for one in (phasor, after))
     expected = 4 * np.pi * 902.75e6 * 0.01 / C
@@ -201,17 +201,17 @@ def test_gradients_are_those_of_finite_differences():
         phasor, fresh = _some(jnp.float64)
 
         @jax.jit
-        def told(values):
+        def score(values):
             start, step, spread, slack, outlier = values[:3], values[3], values[4], values[5], values[6]
             noise = PhaseNoise(spread, slack, outlier)
             value, after = explain(Phasor(start[:2], start[2]), step, fresh, noise, doubled_angle=True)
             return value + 0.1 * jnp.sum(after.total) + after.moved_m
 
         at = jnp.concatenate([phasor.total, phasor.moved_m[None], jnp.asarray([0.013, 0.01, 0.2, 0.05])])
-        gradient = jax.jit(jax.grad(told))(at)
+        gradient = jax.jit(jax.grad(score))(at)
         for i in range(len(at)):
             h = 1e-6
-            change = (told(at.at[i].add(h)) - told(at.at[i].add(-h))) / (2 * h)
+            change = (score(at.at[i].add(h)) - score(at.at[i].add(-h))) / (2 * h)
             assert float(gradient[i]) == pytest.approx(float(change), rel=1e-5, abs=1e-7), i
 
 
@@ -221,11 +221,11 @@ def test_gradients_are_finite_from_nothing(silent):
     if silent:
         fresh = fresh_reads(fresh.reads, NO_CHANNEL, jnp.asarray(5.0), jnp.asarray(5.0))
 
-    def told(phasor, step):
+    def score(phasor, step):
         value, after = explain(phasor, step, fresh, _noise(), doubled_angle=True)
         return value + jnp.sum(after.total)
 
-    gradient = jax.jit(jax.grad(told, argnums=(0, 1)))(Phasor.nothing(()), jnp.asarray(0.0))
+    gradient = jax.jit(jax.grad(score, argnums=(0, 1)))(Phasor.nothing(()), jnp.asarray(0.0))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 

@@ -335,8 +335,8 @@ def test_refined_paths_have_the_gradient_of_their_reads(gradients_agree):
     @jax.jit
     def path(phase_rad):
         # Enough steps to converge: the implicit gradient is that of the minimum.
-        told = _with_phases(reads, phase_rad)
-        return refine_path(told, knots, 0.4 * knots, reference_carrier(told), model, max_steps=40).relative_m[1:]
+        found = _with_phases(reads, phase_rad)
+        return refine_path(found, knots, 0.4 * knots, reference_carrier(found), model, max_steps=40).relative_m[1:]
 
     with jax.enable_x64(True):
         slope = np.asarray(jax.jacrev(path)(reads.phase_rad))
@@ -357,15 +357,15 @@ def test_windowed_distances_have_the_gradient_of_the_phases(gradients_agree):
         frames = jnp.arange(5, 12, dtype=jnp.float64) / 10
 
     @jax.jit
-    def said(phase_rad):
+    def refined(phase_rad):
         window = robust_windows(_with_phases(reads, phase_rad), frames, 5, model)
         std_m = jnp.where(jnp.isfinite(window.std_m), window.std_m, 0.0)
         return jnp.concatenate([window.relative_m[:, 1:], std_m[:, 1:]])
 
     with jax.enable_x64(True):
-        assert int((said(reads.phase_rad)[len(frames) :, -1] > 0).sum()) >= 5
+        assert int((refined(reads.phase_rad)[len(frames) :, -1] > 0).sum()) >= 5
     # Phases grow by 4 pi f / c = 38.6 rad/m, so these are about 1 / 38.6 m/rad; the solver stops at a relative 1e-4.
-    gradients_agree(said, (reads.phase_rad,), atol=3e-6, rtol=1e-3, step=1e-5)
+    gradients_agree(refined, (reads.phase_rad,), atol=3e-6, rtol=1e-3, step=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -374,7 +374,7 @@ def sensitivity():
     frames, knots = jnp.arange(10, dtype=jnp.float32) / 10, jnp.linspace(0.2, 0.8, 6)
     fixed, static = eqx.partition(RadioModel(), eqx.is_array)
 
-    def said(given, channel, valid):
+    def refined(given, channel, valid):
         columns, model = given
         time_s, phase_rad, carrier_hz, sigma_rad = columns
         reads = PhaseReads(time_s, phase_rad, carrier_hz, sigma_rad, channel, valid)
@@ -385,7 +385,7 @@ def sensitivity():
         parts = (window.relative_m, std, refined.relative_m, refined.covariance_m2)
         return sum((jnp.sum(jnp.sin(part)) for part in parts), jnp.zeros(())), window
 
-    taken = jax.jit(jax.value_and_grad(said, has_aux=True))
+    taken = jax.jit(jax.value_and_grad(refined, has_aux=True))
 
     def take(reads):
         columns = (reads.time_s, reads.phase_rad, reads.carrier_hz, reads.sigma_rad)
@@ -464,7 +464,7 @@ def test_windows_are_causal():
     assert bool(jnp.isinf(part.std_m[-5:]).all())
 
 
-def test_it_says_when_it_does_not_know():
+def test_an_unknown_result_is_reported_as_unknown():
     frames = jnp.arange(30, dtype=jnp.float32) / 10
     nothing = _buffer(np.zeros(4), np.zeros(4))
     nothing = PhaseReads(

@@ -309,7 +309,7 @@ def test_a_web_address_without_a_recording_is_an_error(recording, tmp_path, web)
         open_recording("http://127.0.0.1:1/a.zarr")
 
 
-def test_a_missing_package_for_an_address_says_what_to_install(monkeypatch):
+def test_a_missing_package_for_an_address_is_named(monkeypatch):
     def absent(*args, **kwargs):
         raise ImportError("HTTPFileSystem requires aiohttp")
 
@@ -358,7 +358,7 @@ def test_truncated_and_foreign_stores_are_refused(recording, tmp_path):
         open_recording(tmp_path / "nowhere.zarr")
 
 
-def test_missing_depth_is_said_and_refused_where_it_is_needed(recording, tmp_path):
+def test_missing_depth_gives_a_warning_and_is_refused_where_it_is_needed(recording, tmp_path):
     flat = dataclasses.replace(recording, depth=np.zeros_like(recording.depth))
     with pytest.warns(RecordingWarning, match="no depth at all: only systems that need no depth"):
         flat.check()
@@ -423,7 +423,7 @@ def test_zero_reads_are_carried_with_a_warning_until_tracing(recording):
         load_clip(silent, 0, 6, stride=2)
 
 
-def test_one_read_is_carried_and_the_radio_says_that_it_knows_nothing(recording):
+def test_one_read_is_accepted_and_its_distance_is_unknown(recording):
     one = recording.with_reads(recording.reads[30:31])
     one.check()
     clip = load_clip(one, 0, 10, stride=2)
@@ -487,7 +487,7 @@ def test_depth_in_the_wrong_unit_is_an_error(recording):
         dataclasses.replace(recording, depth=(recording.depth * 5000).astype(np.float32)).check()
 
 
-def test_unknown_carriers_are_said_and_left_out(recording):
+def test_unknown_carriers_give_a_warning_and_are_left_out(recording):
     unknown = _with_reads(recording, carrier_hz=np.full(recording.reads.num_reads, np.nan))
     with pytest.warns(RecordingWarning, match="hop table"):
         unknown.check()

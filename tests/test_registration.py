@@ -94,21 +94,21 @@ def _positions(view: DepthToColour, depth_mm: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def estimated():
-    told = _told()
+    found = _told()
     room = Room(3)
-    colour, depth = room.frames(range(0, 48, 2), told.corrected(RESIDUAL))
-    held_out = room.frames(range(1, 48, 6), told.corrected(RESIDUAL))
-    return told, (colour, depth), held_out, estimate_correction(colour, depth, told)
+    colour, depth = room.frames(range(0, 48, 2), found.corrected(RESIDUAL))
+    held_out = room.frames(range(1, 48, 6), found.corrected(RESIDUAL))
+    return found, (colour, depth), held_out, estimate_correction(colour, depth, found)
 
 
 @pytest.mark.ci
 def test_a_known_residual_is_recovered_to_a_pixel_in_held_out_frames(estimated) -> None:
-    told, _, (_, depths), found = estimated
+    result, _, (_, depths), found = estimated
     errors = {"before": [], "after": []}
     for depth in depths:
-        right = _positions(told.corrected(RESIDUAL), depth)
-        errors["before"].append(np.linalg.norm(_positions(told, depth) - right, axis=1))
-        errors["after"].append(np.linalg.norm(_positions(told.corrected(found.correction), depth) - right, axis=1))
+        right = _positions(result.corrected(RESIDUAL), depth)
+        errors["before"].append(np.linalg.norm(_positions(result, depth) - right, axis=1))
+        errors["after"].append(np.linalg.norm(_positions(result.corrected(found.correction), depth) - right, axis=1))
     before, after = (np.concatenate(errors[key]) for key in ("before", "after"))
     assert 7.0 < np.median(before) < 11.0
     assert np.median(after) < 0.5
@@ -116,11 +116,11 @@ def test_a_known_residual_is_recovered_to_a_pixel_in_held_out_frames(estimated) 
 
 
 @pytest.mark.ci
-def test_the_misalignment_told_is_the_one_there_is(estimated) -> None:
-    told, _, (colour, depth), found = estimated
-    right = told.corrected(RESIDUAL)
-    points = [_positions(view, depth[0]) for view in (told, right)]
-    assert misalignment_px(colour, depth, told).median_px == pytest.approx(
+def test_the_reported_misalignment_is_the_true_one(estimated) -> None:
+    result, _, (colour, depth), found = estimated
+    right = result.corrected(RESIDUAL)
+    points = [_positions(view, depth[0]) for view in (result, right)]
+    assert misalignment_px(colour, depth, result).median_px == pytest.approx(
         np.median(np.linalg.norm(points[0] - points[1], axis=1)), abs=1.0
     )
     assert misalignment_px(colour, depth, right).median_px < 0.7
@@ -134,8 +134,8 @@ def test_the_misalignment_told_is_the_one_there_is(estimated) -> None:
 @pytest.mark.ci
 @pytest.mark.parametrize("shift_px", [(0.0, 0.0), pytest.param((14.0, -17.0), marks=pytest.mark.ci)])
 def test_right_is_left_where_it_is_and_far_off_is_brought_back(estimated, shift_px) -> None:
-    told, (colour, depth), _, _ = estimated
-    right = told.corrected(RESIDUAL)
+    found, (colour, depth), _, _ = estimated
+    right = found.corrected(RESIDUAL)
     off = right.corrected((0.0, 0.0, 0.0, 1.0, 1.0, *shift_px))
     mended = off.corrected(estimate_correction(colour, depth, off).correction)
     error = np.linalg.norm(_positions(mended, depth[0]) - _positions(right, depth[0]), axis=1)
@@ -144,11 +144,11 @@ def test_right_is_left_where_it_is_and_far_off_is_brought_back(estimated, shift_
 
 @pytest.mark.ci
 def test_an_estimate_is_the_same_every_time(estimated) -> None:
-    told, (colour, depth), _, found = estimated
-    assert estimate_correction(colour, depth, told).correction == found.correction
+    result, (colour, depth), _, found = estimated
+    assert estimate_correction(colour, depth, result).correction == found.correction
 
 
-def test_a_room_in_which_nothing_moves_cannot_tell() -> None:
+def test_a_room_in_which_nothing_moves_gives_no_estimate() -> None:
     colour, depth = Room(0, num_moving=0).frames(range(6), _told())
     with pytest.raises(RecordingError, match="a person walks"):
         estimate_correction(colour, depth, _told())
@@ -182,21 +182,21 @@ def _written(path, view, colour, depth):
 
 @pytest.fixture
 def folder(estimated, tmp_path):
-    told, (colour, depth), _, _ = estimated
-    return _written(tmp_path, told, colour, depth)
+    found, (colour, depth), _, _ = estimated
+    return _written(tmp_path, found, colour, depth)
 
 
 @pytest.mark.ci
 @pytest.mark.filterwarnings("ignore:The recording has no tag read")
-def test_an_import_estimates_and_tells_so_that_it_can_be_repeated(folder, estimated) -> None:
-    told, (_, depth), _, _ = estimated
+def test_an_import_reports_its_estimate_so_that_it_can_be_repeated(folder, estimated) -> None:
+    result, (_, depth), _, _ = estimated
     settings = ImportSettings(
         video=str(folder), calibration=str(folder / "camera" / "camera.mat"), fps=7.0, correction="estimate"
     )
-    recording, said = import_recording(settings)
-    assert said[0].startswith("Residual registration: ")
+    recording, found = import_recording(settings)
+    assert found[0].startswith("Residual registration: ")
     numbers = [float(word) for word in recording.source.split("correction = [")[1].split("]")[0].split(",")]
-    error = _positions(told.corrected(numbers), depth[0]) - _positions(told.corrected(RESIDUAL), depth[0])
+    error = _positions(result.corrected(numbers), depth[0]) - _positions(result.corrected(RESIDUAL), depth[0])
     assert np.percentile(np.linalg.norm(error, axis=1), 95) < 1.5
     again, said_again = import_recording(dataclasses.replace(settings, correction=tuple(numbers)))
     assert not any(line.startswith("Residual") for line in said_again)
@@ -240,6 +240,6 @@ def test_a_real_residual_is_mended_in_held_out_frames(real_data, name, step) -> 
     assert abs(found.after.mean_shift_px[1]) < 1.0
 
 
-def test_an_unknown_key_of_the_virtual_reader_is_told_before_anything_is_read():
+def test_an_unknown_key_of_the_virtual_reader_is_refused_before_anything_is_read():
     with pytest.raises(ConfigError, match="reader: unknown key 'foo'; known keys are region, num_tags"):
         from_mapping(ImportSettings, {"video": "gone", "reader": {"foo": 1}})

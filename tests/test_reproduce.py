@@ -182,7 +182,7 @@ def test_changes_are_named(root: Path):
         dependencies(root, ["code/*.txt"])
 
 
-def test_a_revision_tells_which_of_the_files_are_not_committed(root: Path):
+def test_a_revision_lists_the_files_that_are_not_committed(root: Path):
     assert revision(root, {}) == {"commit": None, "dirty": None, "modified": []}
 
     def git(*words: str) -> str:
@@ -245,7 +245,7 @@ def test_a_page_shows_the_table_of_its_json(root: Path):
     assert "page.md does not show the table of its JSON" in status(recipe, root)[0]
 
 
-def test_values_measured_on_changed_files_say_so(root: Path):
+def test_values_measured_on_changed_files_are_marked(root: Path):
     table = _made(_recipe(), root)
     table["revision"]["dirty"] = True
     assert "revision `cdcdcdcdcd` with uncommitted changes" in rendered(table)
@@ -260,7 +260,7 @@ def test_values_measured_on_changed_files_say_so(root: Path):
         ("<!-- table: small -->\n<!-- table: other -->\n<!-- /table -->", r"no <!-- /table --> after"),
     ],
 )
-def test_markers_that_are_missing_are_told(text: str, message: str, root: Path):
+def test_missing_markers_are_reported(text: str, message: str, root: Path):
     with pytest.raises(ValueError, match=message):
         replaced(text, "small", "body")
     (root / "page.md").write_text(text)

@@ -38,8 +38,8 @@ def _depth_mm(number: int) -> np.ndarray:
 
 
 def _save_calibration(path: Path, *, translation=(0.0, 0.0, 0.0), **changes) -> Path:
-    told = {"Kdepth": CAMERA, "Krgb": CAMERA, "R": np.eye(3), "T": np.reshape(translation, (3, 1)), **changes}
-    scipy.io.savemat(path, {"cam_params": {name: value for name, value in told.items() if value is not None}})
+    found = {"Kdepth": CAMERA, "Krgb": CAMERA, "R": np.eye(3), "T": np.reshape(translation, (3, 1)), **changes}
+    scipy.io.savemat(path, {"cam_params": {name: value for name, value in found.items() if value is not None}})
     return path
 
 
@@ -220,7 +220,7 @@ def test_garbage_in_a_mat_file_is_an_error_or_the_depth_of_another_picture(tmp_p
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("found", "message"),
     [
         ({"depth": np.zeros((4, 4), np.uint16)}, "no variable 'depth_array'"),
         ({"depth_array": np.zeros((4, 4))}, r"depth_array is float64 of shape \(4, 4\)"),
@@ -228,8 +228,8 @@ def test_garbage_in_a_mat_file_is_an_error_or_the_depth_of_another_picture(tmp_p
         ({"depth_array": "text"}, "depth_array is <U4"),
     ],
 )
-def test_another_mat_file_is_an_error(tmp_path, told, message):
-    scipy.io.savemat(tmp_path / "a.mat", told)
+def test_another_mat_file_is_an_error(tmp_path, found, message):
+    scipy.io.savemat(tmp_path / "a.mat", found)
     with pytest.raises(RecordingError, match=message):
         read_mat_depth(tmp_path / "a.mat")
 

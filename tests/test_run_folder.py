@@ -18,7 +18,7 @@ def _started(folder: Path) -> Path:
     return folder
 
 
-def test_length_may_change_and_the_file_says_so(tmp_path: Path) -> None:
+def test_the_length_may_change_and_the_file_holds_it(tmp_path: Path) -> None:
     longer = {**VALUES, "loop": {"num_steps": 9}, "optimizer": {"decay_steps": 9}}
     keep_configuration(_started(tmp_path), longer)
     assert OmegaConf.load(tmp_path / "config.yaml") == longer

@@ -44,8 +44,8 @@ def _back(tracer: TagAttention, camera: Camera, frames: Frame) -> BackwardMessag
     """What later frames say of each, in the order of time; `frames` go backwards."""
     first = jax.tree.map(lambda leaf: leaf[0], frames)
     step = lambda state, frame: tracer.backward_step(camera, state, frame)  # noqa: E731
-    _, told = jax.lax.scan(step, tracer.init(camera, first), frames)
-    return jax.tree.map(lambda leaf: leaf[::-1], told)
+    _, found = jax.lax.scan(step, tracer.init(camera, first), frames)
+    return jax.tree.map(lambda leaf: leaf[::-1], found)
 
 
 def _outlines(mask: np.ndarray, box: tuple[int, int, int, int]) -> float:
@@ -118,7 +118,7 @@ def test_flow_backwards_is_the_same_pairs_the_other_way_round() -> None:
     assert np.abs(pair_flow(back, 0, 5, "dis")[0]).max() > 1.0
 
 
-def test_the_radio_backwards_tells_the_distances_backwards(recording: Recording) -> None:
+def test_reversed_reads_give_reversed_distances(recording: Recording) -> None:
     """By an independent way: the reads of the turned recording give the truth's differences, frames reversed."""
     clip = load_clip(time_reversed(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
     truth = load_clip(time_reversed(recording), 0, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS, estimator="truth")
@@ -160,17 +160,17 @@ def _load(one: Recording, start: int, stop: int, *, epcs: Sequence[str]) -> Clip
 
 
 @pytest.mark.ci
-def test_the_first_frame_shows_what_the_later_ones_tell(recording: Recording) -> None:
+def test_the_first_frame_uses_the_later_ones(recording: Recording) -> None:
     """Whoever only looks forwards knows nothing yet."""
     settings = ScoreSettings(frames_at_once=7)
 
-    def said(smooth: bool, first: int, last: int) -> list[tuple[int, Trace]]:
+    def traced(smooth: bool, first: int, last: int) -> list[tuple[int, Trace]]:
         chosen = dataclasses.replace(settings, smooth=smooth)
         return list(trace_recording(_tracer(), recording, _load, epcs=EPCS, settings=chosen, frames=(first, last)))
 
-    ((_, filtered),) = said(False, 0, 1)
+    ((_, filtered),) = traced(False, 0, 1)
     for first, last in ((0, NUM_FRAMES), (2, 15)):
-        smoothed = said(True, first, last)
+        smoothed = traced(True, first, last)
         assert [number for number, _ in smoothed] == list(range(first, last))
         for tag, box in enumerate(synthetic.BOXES.values()):
             assert _outlines(smoothed[0][1].mask[tag], box) > 0.6
@@ -210,7 +210,7 @@ def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
     assert any(float(jnp.abs(leaf).max()) > 0 for leaf in leaves)
 
 
-def test_who_goes_forwards_only_is_told_so(tmp_path: Path) -> None:
+def test_a_forward_only_tracer_is_refused_for_smoothing(tmp_path: Path) -> None:
     recording = open_recording(synthetic.stored(tmp_path, 8)[0])
     settings = ScoreSettings(smooth=True, num_pictures=1, moved_for_s=0.2)
     with pytest.raises(RecordingError, match="TagAttentionPaper has no backward pass; expected TagAttention"):

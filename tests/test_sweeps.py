@@ -274,16 +274,16 @@ def test_a_grid_is_swept_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(kept) == 4
     # Killed within the last line: that one is computed again, the others are not.
     (tmp_path / "sweep" / "lines.jsonl").write_text("\n".join(kept[:3]) + "\n" + kept[3][:20])
-    told: list[str] = []
+    found: list[str] = []
     from tagjax.evaluation import sweep
 
     asked: list[str] = []
     evaluate = sweep.evaluate_recording
     monkeypatch.setattr(sweep, "evaluate_recording", lambda *a, **k: asked.append("") or evaluate(*a, **k))
-    again = run_sweep(config, tmp_path / "sweep", on_progress=lambda done, total, name: told.append(f"{done}/{total}"))
+    again = run_sweep(config, tmp_path / "sweep", on_progress=lambda done, total, name: found.append(f"{done}/{total}"))
     assert again == lines
     assert len(asked) == 1
-    assert told[-1] == "3/4"
+    assert found[-1] == "3/4"
     for name in ("table.md", "table.csv", "sweep.png"):
         assert (tmp_path / "sweep" / name).stat().st_size > 50
 
@@ -451,9 +451,9 @@ def test_an_unreachable_wandb_server_gives_an_offline_run(tmp_path: Path, monkey
     wandb.teardown()  # what it knows of the environment is from an earlier run
     for name, value in (("API_KEY", "0" * 40), ("BASE_URL", "http://127.0.0.1:9"), ("INIT_TIMEOUT", "2")):
         monkeypatch.setenv(f"WANDB_{name}", value)
-    with pytest.warns(UserWarning, match="Weights & Biases cannot be reached: .* Logging offline") as told:
+    with pytest.warns(UserWarning, match="Weights & Biases cannot be reached: .* Logging offline") as found:
         logger = Logger(tmp_path, LoggerSettings(mode="online"))
-    assert len([one for one in told if "Weights & Biases" in str(one.message)]) == 1
+    assert len([one for one in found if "Weights & Biases" in str(one.message)]) == 1
     logger.write(1, {"loss": 0.5})
     logger.close()
     wandb.teardown()

@@ -75,7 +75,7 @@ def _write(path, lines, encoding="utf-8"):
 
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
-def test_every_format_says_the_same(tmp_path, name, encoding):
+def test_every_format_gives_the_same_reads(tmp_path, name, encoding):
     path = _write(tmp_path / "table", TABLES[name], encoding)
     reads, _, report = import_table(path, hop_table_hz=[920.625e6, 920.875e6], clock="auto")
     assert report.format == name
@@ -120,7 +120,7 @@ def test_degrees_where_radians_belong_are_refused(tmp_path):
         import_table(_write(tmp_path / "t", lines))
 
 
-def test_a_table_without_phases_says_how_to_get_them(tmp_path):
+def test_a_table_without_phases_is_refused_with_advice(tmp_path):
     lines = ["timestamp,reader,antenna,rssi,epc", f"{HOUR}.25,r,1,-60,{EPC}"]
     with pytest.raises(RecordingError, match="EnableRFPhaseAngle"):
         import_table(_write(tmp_path / "t", lines))
@@ -155,7 +155,7 @@ def test_reads_out_of_order_are_sorted_and_repeats_dropped(tmp_path):
     assert any("out of order" in note for note in report.notes)
 
 
-def test_a_reader_clock_that_was_never_set_is_said(tmp_path):
+def test_a_reader_clock_that_was_never_set_is_reported(tmp_path):
     lines = [line.replace(str(HOUR), "0946694475") for line in TABLES["octane"]]
     with pytest.warns(RecordingWarning, match="started in 2000"):
         reads, _, _ = import_table(_write(tmp_path / "t", lines), clock=1e9)
@@ -191,7 +191,7 @@ def test_stamps_and_epcs():
     assert clean_epc("E200 9366") == "E2009366"
 
 
-def test_formats_are_told_apart_by_their_headers():
+def test_formats_are_recognised_by_their_headers():
     for name, lines in TABLES.items():
         found = recognise(lines)
         assert found is FORMATS[name]

@@ -31,7 +31,7 @@ def clip():
 
 
 @pytest.fixture(scope="module")
-def said(clip):
+def found(clip):
     return eqx.filter_jit(trace)(_learnable(), clip.camera, clip.frames)
 
 
@@ -44,8 +44,8 @@ def _shapes(out, clip):
         assert bool(jnp.isfinite(leaf).all())
 
 
-def test_the_learnable_tracer_finds_both_objects(clip, said):
-    out = said
+def test_the_learnable_tracer_finds_both_objects(clip, found):
+    out = found
     _shapes(out, clip)
     for tag, (x0, y0, x1, y1) in enumerate(synthetic.BOXES.values()):
         mask = np.asarray(out.mask[-1, tag]) > 0.5
@@ -67,8 +67,8 @@ def test_phases_alone_name_both_objects(clip):
         assert float(spoken.confidence[-1, tag]) > 0.9
 
 
-def test_step_follows_the_objects_distance(clip, said):
-    out = said
+def test_step_follows_the_objects_distance(clip, found):
+    out = found
     time_s = np.asarray(clip.frames.time_s)
     for tag, label in enumerate(synthetic.BOXES):
         expected = np.diff(synthetic.offset_m(label, time_s))[-8:]
@@ -79,7 +79,7 @@ def test_step_follows_the_objects_distance(clip, said):
 def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip):
     """Without rivalry any number of tags and antennas are as one: each tag is traced by what was heard of it alone."""
     tracer = _learnable(rivalry=1e-12)
-    said = eqx.filter_jit(trace)(tracer, clip.camera, clip.frames)
+    found = eqx.filter_jit(trace)(tracer, clip.camera, clip.frames)
     alone = load_clip(synthetic.recording(24), 0, 24, stride=1, epcs=[clip.epcs[1]])
     frames = alone.frames
     twice = lambda part: jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf], axis=2), part)  # noqa: E731
@@ -94,8 +94,8 @@ def test_neither_other_tags_nor_a_deaf_antenna_disturb(clip):
     )
     camera = eqx.tree_at(lambda c: c.antennas_m, alone.camera, jnp.asarray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5]]))
     single = eqx.filter_jit(trace)(tracer, camera, deaf)
-    np.testing.assert_allclose(said.mask[:, 1], single.mask[:, 0], atol=1e-4)
-    np.testing.assert_allclose(said.step_m[:, 1, 0], single.step_m[:, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(found.mask[:, 1], single.mask[:, 0], atol=1e-4)
+    np.testing.assert_allclose(found.step_m[:, 1, 0], single.step_m[:, 0, 0], atol=1e-4)
 
 
 @pytest.mark.ci
@@ -115,7 +115,7 @@ def test_two_tags_of_one_thing_both_find_it(clip):
 
 
 @pytest.mark.ci
-def test_the_reads_tell_that_a_tag_has_moved(clip):
+def test_reads_show_that_a_tag_has_moved(clip):
     """Evidence against rest grows for a tag that moves, not for one whose phases never change, and raises doubt of it."""
     reads = clip.frames.reads
     constant = 1.0 + reads.channel[:, 1].astype(jnp.float32)
@@ -179,8 +179,8 @@ def test_scan_is_the_loop_of_steps(clip):
     shapes = jax.tree.map(jnp.shape, state)
     step = eqx.filter_jit(tracer.step)
     for t in range(5):
-        state, said = step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], few))
-        np.testing.assert_allclose(said.mask, scanned.mask[t], atol=1e-4)
+        state, found = step(clip.camera, state, jax.tree.map(lambda leaf, t=t: leaf[t], few))
+        np.testing.assert_allclose(found.mask, scanned.mask[t], atol=1e-4)
     assert jax.tree.map(jnp.shape, tracer.finish(state)) == shapes
 
 
@@ -363,7 +363,7 @@ def test_even_odds_are_no_claim():
 def test_only_frames_and_reads_enter(clip):
     """A tracer's input holds no labels: what it says cannot depend on truth.
 
-    `colour` is for flow networks that learn; `later` is what such a pass backwards said.
+    `colour` is for flow networks that learn; `later` is what such a pass backwards found.
     """
     assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour", "backward_message"} == set(
         Frame.__dataclass_fields__

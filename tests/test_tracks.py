@@ -179,7 +179,7 @@ def test_the_configuration_names_every_setting():
 
 
 @pytest.mark.ci
-def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path):
+def test_every_method_finds_the_carrier_on_clean_walks(folder, tmp_path):
     """Without noise, flips or hops a window of 4 s suffices for all of them; a run writes what it found."""
     config = TracksConfig(
         str(folder),
@@ -203,7 +203,7 @@ def test_every_method_finds_who_carries_the_tag_on_clean_walks(folder, tmp_path)
 
 @pytest.mark.real_data
 @pytest.mark.ci
-def test_real_tracks_tell_the_carrier_better_the_longer_one_looks(real_data, tmp_path):
+def test_longer_windows_identify_the_carrier_of_real_tracks_better(real_data, tmp_path):
     rows = run_tracks(TracksConfig(str(real_data / "tracks"), windows_s=(1.0, 4.0), max_windows=16), tmp_path)["rows"]
     assert {row["scene"] for row in rows} == {"kinect-rfid", "xovis-uwb"}
     for row in rows:
@@ -260,9 +260,9 @@ def tagged_folder(tmp_path_factory) -> Path:
 
 def test_a_tag_s_speed_at_a_time_is_that_of_the_reads_around_it():
     speeds = Speeds(np.concatenate([np.arange(0, 4, 0.02), [9.0]]), np.concatenate([np.full(200, 0.7), [5.0]]))
-    heard = measured_speed(speeds, np.array([1.0, 2.0, 6.0, 9.0]))
-    np.testing.assert_allclose(heard[:2], 0.7)
-    assert np.isnan(heard[2:]).all()  # none near, and one alone
+    found = measured_speed(speeds, np.array([1.0, 2.0, 6.0, 9.0]))
+    np.testing.assert_allclose(found[:2], 0.7)
+    assert np.isnan(found[2:]).all()  # none near, and one alone
 
 
 def test_the_antenna_and_the_clocks_come_out_of_a_tag_s_speeds(tagged_folder):
@@ -280,16 +280,16 @@ def test_the_antenna_and_the_clocks_come_out_of_a_tag_s_speeds(tagged_folder):
     np.testing.assert_allclose([one.lag_s for one in together], LAGS_S, atol=0.1)
     # At that place a correlation is NumPy's own over the frames that both cover.
     (given,) = align([(first.walks[0], first.speeds)], ANTENNA_M[None])
-    heard = measured_speed(first.speeds, first.walks[0].time_s - given.lag_s)
+    found = measured_speed(first.speeds, first.walks[0].time_s - given.lag_s)
     seen = first.walks[0].towards_m_s(ANTENNA_M)
-    both = np.isfinite(heard)
-    assert given.correlation == pytest.approx(np.corrcoef(heard[both], seen[both])[0, 1], abs=2e-3)
-    assert given.slope == pytest.approx(np.polyfit(seen[both], heard[both], 1)[0], rel=0.01)
+    both = np.isfinite(found)
+    assert given.correlation == pytest.approx(np.corrcoef(found[both], seen[both])[0, 1], abs=2e-3)
+    assert given.slope == pytest.approx(np.polyfit(seen[both], found[both], 1)[0], rel=0.01)
     still = Walk("still", first.walks[0].time_s, np.zeros_like(first.walks[0].position_m))
     assert align([(still, first.speeds)], ANTENNA_M[None])[0].correlation == 0.0
 
 
-def test_real_tags_are_told_by_antennas_that_other_recordings_place(tagged_folder, tmp_path):
+def test_real_tags_are_identified_with_antennas_placed_by_other_recordings(tagged_folder, tmp_path):
     found = associate(load_tagged(tagged_folder / "kinect-rfid", RATE_HZ))
     for one, lag_s in zip(found, LAGS_S, strict=True):
         assert one.carrier == 0
@@ -372,7 +372,7 @@ def test_speeds_that_are_none_are_named(tmp_path, line, message):
 
 @pytest.mark.ci
 @pytest.mark.real_data
-def test_real_tags_are_carried_by_who_walks_as_they_do(real_data):
+def test_real_tags_are_carried_by_the_person_who_walks_alike(real_data):
     """Three recordings of other days agree on where the antenna stood, and each tag's carrier suits it best by far."""
     found = associate(load_tagged(real_data / "tracks" / "kinect-rfid", RATE_HZ))
     assert [one.carrier for one in found] == [0, 0, 0]

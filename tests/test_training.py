@@ -108,7 +108,7 @@ def test_true_motion_explains_own_reads_and_no_others() -> None:
 
 
 @pytest.mark.ci
-def test_likelihood_tells_tags_apart_whatever_is_flipped() -> None:
+def test_the_likelihood_separates_tags_with_any_flips() -> None:
     settings = dataclasses.replace(SETTINGS, evidence="likelihood", temperature=2.0)
     seen = _said_with_true_steps(_clip())
     flips = np.random.default_rng(0).uniform(size=seen.reads.phase_rad.shape) < 0.1
@@ -151,14 +151,14 @@ def test_confidence_is_best_as_the_share_of_pieces_that_are_won() -> None:
     # Tags that win and lose, each with its own confidence: only its own counts, and only the frames of the piece.
     one_lost = eqx.tree_at(lambda s: s.trace.step_m, seen, seen.trace.step_m.at[:, 1].set(-seen.trace.step_m[:, 1]))
     sure = jnp.tile(jnp.array([0.8, 0.1]), (seen.trace.confidence.shape[0], 1)).at[: SETTINGS.skip_frames + 1].set(0.5)
-    told = eqx.tree_at(lambda s: s.trace.confidence, one_lost, sure)
-    weight = np.asarray(eqx.filter_jit(agreement)(told, SETTINGS, KEY).calibration_weight).sum(axis=1)
+    found = eqx.tree_at(lambda s: s.trace.confidence, one_lost, sure)
+    weight = np.asarray(eqx.filter_jit(agreement)(found, SETTINGS, KEY).calibration_weight).sum(axis=1)
     expected = np.average([-np.log(0.8), -np.log(0.9)], weights=weight)
-    assert float(judge(told)) == pytest.approx(expected, rel=1e-4)
-    slope = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.trace.confidence, told, p)))(sure)
+    assert float(judge(found)) == pytest.approx(expected, rel=1e-4)
+    slope = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.trace.confidence, found, p)))(sure)
     assert (np.asarray(slope)[SETTINGS.skip_frames + 1 :] * np.array([-1.0, 1.0]) >= 0).all()
     assert not np.asarray(slope)[: SETTINGS.skip_frames + 1].any()
-    certain = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.trace.confidence, told, p)))(jnp.zeros_like(sure))
+    certain = jax.grad(lambda p: judge(eqx.tree_at(lambda s: s.trace.confidence, found, p)))(jnp.zeros_like(sure))
     assert bool(jnp.isfinite(certain).all())
 
 
@@ -183,9 +183,9 @@ def test_future_agreement_outlines_the_moving_object() -> None:
     assert bool(valid.all())
     labels = np.asarray(synthetic.recording(1).truth.labels[0])  # type: ignore[union-attr, index]
     for tag, label in enumerate((1, 2)):
-        told = np.asarray(weight[:, tag]) > 0.5
-        assert told.sum() > 3
-        mean = np.asarray(agrees[:, tag])[told].mean(axis=0)
+        found = np.asarray(weight[:, tag]) > 0.5
+        assert found.sum() > 3
+        mean = np.asarray(agrees[:, tag])[found].mean(axis=0)
         assert mean[labels == label].min() > 0.95
         assert mean[labels == 0].max() < 1e-5
 
@@ -412,14 +412,14 @@ def test_resuming_is_exact_bit_for_bit(tmp_path: Path) -> None:
 
 def test_steps_before_samples_that_cannot_be_read_are_kept(tmp_path: Path) -> None:
     straight = _run(tmp_path / "straight", 6)
-    with pytest.raises(RecordingError, match="frame 7") as told:
+    with pytest.raises(RecordingError, match="frame 7") as found:
         _run(tmp_path / "new", 6, fail_at=2)
-    assert not hasattr(told.value, "__notes__")
+    assert not hasattr(found.value, "__notes__")
     # Nothing was done, so nothing is in the way of another try.
     assert not list((tmp_path / "new" / "checkpoints").iterdir())
-    with pytest.raises(RecordingError, match="frame 7") as told:
+    with pytest.raises(RecordingError, match="frame 7") as found:
         _run(tmp_path / "broken", 6, fail_at=10)  # the second of the two clips of step 5, between checkpoints
-    assert "saved at step 4" in told.value.__notes__[0]
+    assert "saved at step 4" in found.value.__notes__[0]
     with pytest.raises(RecordingError, match="frame 7"):
         _run(tmp_path / "broken", 6, fail_at=1)
     resumed = _run(tmp_path / "broken", 6)
@@ -529,7 +529,7 @@ def test_unknown_logger_mode_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
 
 # Orbax leaves the event loop of a failed read behind.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_foreign_and_damaged_checkpoints_say_so(tmp_path: Path) -> None:
+def test_foreign_and_damaged_checkpoints_are_refused(tmp_path: Path) -> None:
     state, _ = _fresh()
     with pytest.raises(CheckpointError, match="no such folder"):
         Checkpoints(tmp_path / "nowhere", create=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from . import clocks, names, real_tables, tables, targets, weights
+from . import clocks, kills, names, real_tables, tables, targets, weights
 from .outcome import Outcome
 
 KINDS: dict[str, Callable[[int, int, Path], list[Outcome]]] = {
@@ -15,5 +15,6 @@ KINDS: dict[str, Callable[[int, int, Path], list[Outcome]]] = {
     "tables": tables.trial,
     "real_tables": real_tables.trial,
     "weights": weights.trial,
+    "kills": kills.trial,
 }
 """By name the function that tries `number` faults, drawn from `seed`, in an empty folder: `trial(number, seed, folder)`."""
