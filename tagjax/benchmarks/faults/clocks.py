@@ -43,7 +43,7 @@ class ClockSettings:
 
 CLOCK_TABLES = {
     "batches": ClockSettings(
-        span_s=300.0, rate_hz=120.0, min_latency_s=0.01, spread_s=0.09, batches=True, drift_ppm=30.0
+        span_s=120.0, rate_hz=100.0, min_latency_s=0.01, spread_s=0.09, batches=True, drift_ppm=30.0
     ),
     "few reads": ClockSettings(
         span_s=600.0, rate_hz=4.0, min_latency_s=0.005, spread_s=0.02, batches=False, drift_ppm=-45.0
@@ -100,6 +100,12 @@ def _stop(reader: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return reader
 
 
+def _first_arrival(table: ClockTable, rng: np.random.Generator) -> ClockTable:
+    arrival = table.arrival_ns.copy()
+    arrival[[0, -1]] = 10**6
+    return dataclasses.replace(table, arrival_ns=arrival)
+
+
 def _host_set(table: ClockTable, rng: np.random.Generator) -> ClockTable:
     start, step = len(table.arrival_ns) // 3, 2 * 10**9
     late = np.arange(len(table.arrival_ns)) >= start
@@ -136,6 +142,7 @@ FAULTS: dict[str, tuple[Callable[[ClockTable, np.random.Generator], ClockTable],
     "sixteen rows": (_few, False),
     "host's clock set forward by 2 s": (_host_set, False),
     "arrivals held up for 3 s": (_outage, False),
+    "first and last time of arrival are in 1970": (_first_arrival, False),
     "rows sorted by tag": (_sorted_otherwise, False),
     "reader's clock stands still": (_reader(lambda reader, rng: np.full_like(reader, reader[0])), True),
     "reader's clock stops half-way": (_reader(_stop), True),

@@ -141,7 +141,7 @@ def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
     # Integers are subtracted before they become float64 seconds, which resolve 1.7e9 s to 0.2 us only.
     reference, base = _median(reader), _median(arrival - reader)
     since_s, delay_s = (reader - reference) * 1e-9, (arrival - reader - base) * 1e-9
-    usual = np.abs(delay_s - scipy.ndimage.median_filter(delay_s, 5, mode="nearest")) < _LATE_S
+    usual = np.abs(delay_s - _running_median(delay_s)) < _LATE_S
     if usual.sum() < 2:
         usual[:] = True
     drift, drift_interval, spread_s = _drift(since_s[usual], delay_s[usual])
@@ -149,7 +149,7 @@ def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
         raise RecordingError(_no_clock(reader[usual], arrival[usual], drift))
     low, offset_s, high = _smallest(delay_s[usual] - drift * since_s[usual])
     late_s = delay_s - drift * since_s - offset_s
-    neighbours_s = np.maximum(scipy.ndimage.median_filter(late_s, 5, mode="nearest"), 0)
+    neighbours_s = np.maximum(_running_median(late_s), 0)
     piece = ClockPiece(
         reference_ns=reference,
         num_reads=len(reader),
@@ -213,6 +213,11 @@ def _no_clock(reader: np.ndarray, arrival: np.ndarray, drift: float) -> str:
         f"ppm); expected a difference of at most {MAX_DRIFT_PPM:.0f} ppm. A wrong unit, or a clock that does not run: import "
         "with clock=arrival."
     )
+
+
+def _running_median(values: np.ndarray) -> np.ndarray:
+    """The median of seven neighbours; at an end the values inside count twice, so that a wrong first row stands out."""
+    return scipy.ndimage.median_filter(values, 7, mode="mirror")
 
 
 def _median(values: np.ndarray) -> int:
