@@ -318,7 +318,12 @@ def test_a_minute_of_fuzzed_tables(tmp_path: Path) -> None:
 @pytest.mark.real_data
 @pytest.mark.parametrize(
     "path",
-    ["sllurp-hopping/static/1ft.csv", "sllurp-hopping/moving/MoveTest1-1.csv", "antenna-rail/rail_50_positions.csv"],
+    [
+        "sllurp-hopping/static/1ft.csv",
+        "sllurp-hopping/moving/MoveTest1-1.csv",
+        "antenna-rail/rail_50_positions.csv",
+        "tagbeat/wind-1.csv",
+    ],
 )
 def test_damaged_real_tables_are_imported_with_counts_or_refused_in_one_line(
     real_data: Path, tmp_path: Path, path: str
