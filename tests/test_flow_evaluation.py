@@ -214,7 +214,7 @@ def filmed(tmp_path) -> Path:
     hidden = np.zeros((7, 48, 64), bool)
     hidden[:, :, -2:] = True
     truth = Truth(flow_px=flow, occluded=hidden)
-    save_recording(dataclasses.replace(made, colour=colour, truth=truth, name="a/b"), tmp_path / "a.zarr")
+    save_recording(dataclasses.replace(made, colour=colour, truth=truth, name="a-b"), tmp_path / "a.zarr")
     return tmp_path / "a.zarr"
 
 
@@ -257,7 +257,7 @@ def test_an_evaluation_scores_every_flow_on_every_material(scenes, filmed, tmp_p
     )
     names = sorted(path.name for path in (folder / "panels").iterdir())
     assert names == [
-        "a_b-0000.png", "a_b-0004.png", "drawn-000.png", "drawn-002.png", "frames-0000.png", "moved.png", "unknown.png",
+        "a-b-0000.png", "a-b-0004.png", "drawn-000.png", "drawn-002.png", "frames-0000.png", "moved.png", "unknown.png",
     ]  # fmt: skip
     panel = cv2.imread(str(folder / "panels" / "moved.png"))
     assert panel is not None
@@ -325,7 +325,7 @@ def test_materials_that_cannot_be_used_are_refused(scenes, filmed, tmp_path):
     with pytest.raises(RecordingError, match="expected a recording"):
         sequence_material((str(tmp_path / "b.mp4"),), tmp_path, every=1, max_pairs=1)
     twice = recording_material((str(filmed), str(filmed)), every=5, max_pairs=9)
-    assert [case.source for case in twice.cases()] == ["a/b-0", "a/b-0", "a/b-1", "a/b-1"]
+    assert [case.source for case in twice.cases()] == ["a-b-0", "a-b-0", "a-b-1", "a-b-1"]
 
 
 @pytest.mark.parametrize(

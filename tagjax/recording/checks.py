@@ -48,7 +48,7 @@ def check_geometry(recording: Recording) -> None:
             f"{name}: antennas_m is {antennas.dtype} of shape {antennas.shape}; expected (antennas, 3) metres, one row at least."
         )
     if not np.all(np.isfinite(antennas)):
-        raise RecordingError(f"{name}: antennas_m holds values that are not finite; expected metres.")
+        raise RecordingError(f"{name}: antennas_m holds values that are not finite; expected finite metres.")
     farthest_m = float(np.linalg.norm(antennas.astype(float), axis=1).max())
     if farthest_m > MAX_ANTENNA_M:
         raise RecordingError(
