@@ -160,6 +160,8 @@ def _wrong_after_kill(job: Job, out: Path, expected: Mapping[str, str], folder: 
             _finish(job, out, folder)
         except subprocess.CalledProcessError as error:
             return f"started again, it ended with {error.returncode}: {error.stderr.strip()[-300:]}"
+        except subprocess.TimeoutExpired:
+            return f"started again, it did not end within {_TIMEOUT_S} s"
     return differences(job.contents(out), expected, complete=True)
 
 
