@@ -60,19 +60,24 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def _start(command: list[str], **environment: str) -> subprocess.Popen[str]:
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    pipes: dict[str, Any] = {
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+        "start_new_session": True,
+    }
     return subprocess.Popen(command, cwd=ROOT, env=_environment() | environment, **pipes)
 
 
 def _signal_when(process: subprocess.Popen[str], ready: Callable[[], Any], number: int) -> str:
-    """Send the signal when the program is ready for it, and return what it writes to stderr."""
+    """Send the signal, when the program is ready for it, to all its processes, and return what they write to stderr."""
     try:
         deadline = time.monotonic() + 200
         while not ready():
             assert process.poll() is None, process.communicate()[1][-3000:]
             assert time.monotonic() < deadline
             time.sleep(0.01)
-        process.send_signal(number)
+        os.killpg(process.pid, number)  # as a terminal and a scheduler do
         return process.communicate(timeout=200)[1]
     finally:
         process.kill()
@@ -235,6 +240,23 @@ def test_a_run_that_sigterm_stopped_does_not_start_the_next_command_and_resumes(
         assert stopped == _steps_logged(broken)[-1]
     _finish(_train(scene, broken))
     _same(straight, broken)
+
+
+@pytest.mark.ci
+@pytest.mark.usefixtures("compiled_once")
+@both_signals
+def test_training_that_is_interrupted_while_its_workers_import_ends_in_one_line(
+    number: signal.Signals, scene: str, tmp_path: Path
+) -> None:
+    process = _start(_train(scene, tmp_path / "run", "data.clips.workers=2"))
+
+    def started() -> bool:
+        return process.poll() is None and len(psutil.Process(process.pid).children(recursive=True)) > 2
+
+    error = _signal_when(process, started, number)
+    assert process.returncode == STATUS[number]
+    assert error.strip().splitlines()[-1] == f"train: {TEXT[number]}"
+    assert "Traceback" not in error
 
 
 @pytest.mark.parametrize(("status", "requeued"), [(0, False), (1, False), (130, False), (143, True)])

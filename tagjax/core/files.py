@@ -87,8 +87,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     with writing(path):
         make_folder(path.parent)
         _remove_abandoned(path)
-        unique = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-        partial = path.with_name(f".{path.name}.{unique}.partial")
+        partial = path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.partial")
         try:
             yield partial
             os.replace(partial, path)
@@ -118,13 +117,18 @@ def remove(path: Path) -> None:
 
 def _remove_abandoned(path: Path) -> None:
     """Remove what killed processes of this machine left of `path`."""
-    start = f".{path.name}.{socket.gethostname()}-"
+    start = f".{path.name}.{_host()}-"
     with os.scandir(path.parent) as entries:
         names = [entry.name for entry in entries if entry.name.startswith(start) and entry.name.endswith(".partial")]
     for name in names:
         process = name.removeprefix(start).split("-")[0]
         if process.isdigit() and not _runs(int(process)):
             remove(path.with_name(name))
+
+
+def _host() -> str:
+    """The machine's name, cut so that names of files stay within the limit of a file system."""
+    return socket.gethostname()[:16]
 
 
 def _runs(process: int) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -21,7 +22,7 @@ import numpy as np
 from ...recording.image_files import write_image
 from ...recording.importers.rgbd_folder import TUM_SHAPE
 from .outcome import Outcome
-from .run_contents import DAMAGED, recording_contents, run_contents, visible_contents
+from .run_contents import DAMAGED, recording_contents, run_contents
 
 _SETTINGS = {
     "train": (
@@ -126,17 +127,19 @@ def _job_trial(job: Job, number: int, rng: np.random.Generator, folder: Path) ->
         return Outcome(job.kind, number, number, ("two undisturbed runs differ",))
     failures = []
     for one in range(number):
-        moment_s = float(rng.uniform(0.0, elapsed_s))
-        found = _killed_and_resumed(job, scratch / str(one), moment_s, expected, folder)
+        out = scratch / str(one)
+        while not _killed(job, out, moment_s := float(rng.uniform(0.0, elapsed_s)), folder):
+            shutil.rmtree(out)  # it ended before that moment: another one is drawn
+        found = _wrong_after_kill(job, out, expected, folder)
         if found is not None:
             failures.append(f"{job.command} killed after {moment_s:.2f} s of {elapsed_s:.2f} s: {found}")
         else:
-            shutil.rmtree(scratch / str(one))
+            shutil.rmtree(out, ignore_errors=True)
     return Outcome(job.kind, number, len(failures), tuple(failures[:5]))
 
 
-def _killed_and_resumed(job: Job, out: Path, moment_s: float, expected: Mapping[str, str], folder: Path) -> str | None:
-    """What is wrong after a kill and a second start; None if nothing is."""
+def _killed(job: Job, out: Path, moment_s: float, folder: Path) -> bool:
+    """Start the command and kill it after a time; False if it has ended before."""
     with subprocess.Popen(
         job.argv(out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **_place(folder)
     ) as process:
@@ -144,13 +147,21 @@ def _killed_and_resumed(job: Job, out: Path, moment_s: float, expected: Mapping[
             process.wait(timeout=moment_s)
         except subprocess.TimeoutExpired:
             process.kill()
-    if damaged := differences(visible_contents(job.contents, out), expected, complete=False):
+    return process.returncode == -signal.SIGKILL
+
+
+def _wrong_after_kill(job: Job, out: Path, expected: Mapping[str, str], folder: Path) -> str | None:
+    """What is wrong with what a killed command has left, and with the result of a second start; None if nothing is."""
+    left = job.contents(out) if out.is_dir() else {}
+    if damaged := differences(left, expected, complete=False):
         return f"visible after the kill: {damaged}"
-    if not (job.once and job.contents(out) == expected):
+    if not (job.once and left == expected):
         try:
             _finish(job, out, folder)
         except subprocess.CalledProcessError as error:
             return f"started again, it ended with {error.returncode}: {error.stderr.strip()[-300:]}"
+        except subprocess.TimeoutExpired:
+            return f"started again, it did not end within {_TIMEOUT_S} s"
     return differences(job.contents(out), expected, complete=True)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +44,6 @@ def run_contents(folder: Path) -> dict[str, str]:
         else:
             found[name] = _digest(path.read_bytes())
     return found | _checkpoints(folder / "checkpoints")
-
-
-def visible_contents(contents: Callable[[Path], Mapping[str, str]], folder: Path) -> dict[str, str]:
-    """The contents of a folder that a killed command may have left in any state, also before it was created."""
-    return dict(contents(folder)) if folder.is_dir() else {}
 
 
 def _checkpoints(folder: Path) -> dict[str, str]:
