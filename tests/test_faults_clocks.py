@@ -11,6 +11,7 @@ from tagjax.benchmarks.faults.clocks import (
     CLOCK_TABLES,
     FAULTS,
     MAX_ERROR_S,
+    MAY_BE_REFUSED,
     ClockTable,
     median_error_s,
     sound_table,
@@ -31,7 +32,7 @@ def test_every_fault_is_corrected_or_refused(table, fault):
     change, refused = FAULTS[fault]
     rng = np.random.default_rng(11)
     faulty = change(sound_table(CLOCK_TABLES[table], rng), rng)
-    _check(faulty, refused=refused, may_be_refused=fault == "sixteen rows")
+    _check(faulty, refused=refused, may_be_refused=fault in MAY_BE_REFUSED)
 
 
 def _check(faulty, *, refused, may_be_refused):
@@ -42,7 +43,7 @@ def _check(faulty, *, refused, may_be_refused):
         refusal = str(error)
     if error_s is None:
         assert refused or may_be_refused, refusal
-        assert "clock=arrival" in refusal
+        assert "clock=" in refusal
     else:
         assert not refused
         assert error_s <= MAX_ERROR_S
@@ -67,7 +68,7 @@ def test_real_tables(real_data, name, fault):
     sound = ClockTable(reader, arrival, to_host_clock(reader, arrival).time_ns)
     change, refused = FAULTS[fault]
     faulty = change(sound, np.random.default_rng(3))
-    _check(faulty, refused=refused, may_be_refused=fault == "sixteen rows")
+    _check(faulty, refused=refused, may_be_refused=fault in MAY_BE_REFUSED)
 
 
 def test_intervals_hold_the_truth():
@@ -113,13 +114,12 @@ def test_an_import_reports_pieces_and_rejected_rows_and_keeps_raw_times(tmp_path
     reader[300] = 0
     path = tmp_path / "t.csv"
     path.write_text("\n".join(_tagbeat_lines(reader, table.arrival_ns)))
-    with pytest.warns(UserWarning, match="started in 1970"):
-        reads, audit, report = import_table(path, carrier_hz=920e6)
+    reads, audit, report = import_table(path, carrier_hz=920e6)
     assert report.rejected == {"the reader's time fits no clock": 1}
     assert len(audit.pieces) == 2
     text = "\n".join(report.notes)
     assert "piece 1 of 2" in text
-    assert "set anew or restarted 1 times" in text
+    assert "set anew or restarted 1 time" in text
     kept = np.delete(np.arange(len(reader)), 300)
     np.testing.assert_array_equal(reads.reader_time_ns, reader[kept])
     np.testing.assert_array_equal(reads.arrival_time_ns, table.arrival_ns[kept])

@@ -60,6 +60,8 @@ def check_geometry(recording: Recording) -> None:
 def check_time_of_reads(recording: Recording) -> None:
     """Raise `RecordingError` if most reads lie outside of the video's time; warn if some do."""
     reads, time_ns = recording.reads, recording.time_ns
+    if recording.num_frames < 2:
+        return
     outside = float(np.mean((reads.time_ns < time_ns[0]) | (reads.time_ns > time_ns[-1])))
     if outside <= _WARN_OUTSIDE:
         return

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..recording import ClockAudit, Intrinsics, Recording, TagReads, Truth
+from ..recording import ClockAudit, Intrinsics, Recording, RecordingError, TagReads, Truth
 from ..recording.importers.clock import to_host_clock
 from ..recording.virtual_tags import Track
 from .radio.environment import room_environment
@@ -226,7 +226,10 @@ def _read_tags(scenario: Scenario, seed: int) -> tuple[TagReads, ClockAudit | No
     if reads.reader_time_ns is None or reads.num_reads < 2:
         return reads, None, sight
     # As importers do: times of the reader's clock, converted to the host's clock.
-    converted = to_host_clock(reads.reader_time_ns, reads.time_ns)
+    try:
+        converted = to_host_clock(reads.reader_time_ns, reads.time_ns)
+    except RecordingError:  # too few reads to compare the clocks: importers would take the times of arrival
+        return dataclasses.replace(reads, arrival_time_ns=reads.time_ns), None, sight
     reads = dataclasses.replace(reads, time_ns=converted.time_ns, arrival_time_ns=reads.time_ns)
     return reads[converted.usable], converted.audit, sight
 

@@ -7,6 +7,7 @@ of clock skew from network delay measurements", INFOCOM 1999).
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import datetime as dt
 
@@ -31,11 +32,12 @@ MAX_UNCERTAINTY_S = 0.005
 """A piece of few reads that do not give its offset to so many seconds is set aside."""
 
 _EARLY_S = 0.1  # a read that arrived so long before it was made has a wrong time
-_LATE_S = 1.0  # a read that arrived so much later than its neighbours has a wrong time
-_QUEUE_S = 0.1  # a change of the delay over a piece without drift that queues explain
-_MANY_READS = 300  # so many have a quantile of 1 %
-_BIN_READS = 50  # the smallest delay of so many reads is one point of the envelope
-_MIN_BINS, _MAX_BINS = 12, 60
+_LATE_S = 1.0  # the order of arrivals may differ from the order of reads by so much
+_SWAPPED_S = 0.005  # reads that are reported in another order than they were made are so close in time
+_GROUP_READS = 50  # the smallest delay of so many reads is one point of the envelope, of fewer in a small table
+_MIN_GROUP_READS = 5
+_MIN_POINTS, _MAX_POINTS = 12, 60
+_COARSE_NS = 50_000_000
 _NORMAL = 1.4826  # standard deviation of a normal distribution in median absolute deviations
 
 _YEAR_2010_NS = int(dt.datetime(2010, 1, 1, tzinfo=dt.UTC).timestamp()) * 10**9
@@ -72,8 +74,8 @@ def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> HostTimes:
         )
     reader, arrival = np.asarray(reader_ns, np.int64), np.asarray(arrival_ns, np.int64)
     order = np.arange(len(reader))
-    if np.mean(np.diff(arrival) < 0) > 0.05:  # the table is sorted by something else, by EPC for example
-        order = np.argsort(arrival, kind="stable")
+    if max(_in_order(reader, _SWAPPED_S).mean(), _in_order(arrival, _LATE_S).mean()) < 1 - MAX_SET_ASIDE:
+        order = np.lexsort((reader, arrival))  # the table is sorted by something else, by EPC for example
     reader, arrival = reader[order], arrival[order]
     repeats = _repeats(reader, arrival)
     time_ns, usable = arrival.copy(), np.zeros(len(reader), bool)
@@ -86,9 +88,9 @@ def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> HostTimes:
     num_set_aside = int(np.sum(~usable))
     if num_set_aside > max(1.0, MAX_SET_ASIDE * len(reader)):
         raise RecordingError(
-            f"{num_set_aside} of {len(reader)} reader times fit no clock that runs beside the times of arrival, or are too few "
-            f"to know its offset to {1e3 * MAX_UNCERTAINTY_S:.0f} ms; expected at most {MAX_SET_ASIDE:.0%}. Import with "
-            "clock=arrival."
+            f"{num_set_aside} of {len(reader)} reader times differ from the times of arrival by more than delays explain, or are "
+            f"too few to know the offset of the clocks to {1e3 * MAX_UNCERTAINTY_S:.0f} ms; expected at most {MAX_SET_ASIDE:.0%}. "
+            "Import with clock=arrival."
         )
     epoch = reader_epoch(reader[usable])
     audit = ClockAudit(
@@ -120,6 +122,11 @@ def _repeats(reader: np.ndarray, arrival: np.ndarray) -> np.ndarray:
             f"All {len(reader)} times of arrival are the same, while the reader's clock runs for {np.ptp(reader) * 1e-9:.3g} s. "
             "Import with clock=reader, or with clock=<seconds to add to it>."
         )
+    if len(reader) > 9 and (arrival % _COARSE_NS == 0).all():
+        raise RecordingError(
+            f"All times of arrival are multiples of {_COARSE_NS * 1e-9:g} s; expected a resolution of milliseconds. Import with "
+            "clock=reader, or with clock=<seconds to add to it>."
+        )
     first = np.maximum.accumulate(np.where(np.r_[True, np.diff(reader) != 0], np.arange(len(reader)), 0))
     return (arrival - arrival[first]) * 1e-9 > _EARLY_S
 
@@ -138,86 +145,110 @@ class _Fit:
 
 def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
     """Offset and drift of one piece, and which of its rows fit them."""
+    in_order = _in_order(reader, _SWAPPED_S) & _in_order(arrival, _LATE_S)
+    if 2 * in_order.sum() < len(reader) and len(reader) > 2:
+        raise RecordingError(_no_clock(reader, arrival, "its times do not increase"))
     # Integers are subtracted before they become float64 seconds, which resolve 1.7e9 s to 0.2 us only.
-    reference, base = _median(reader), _median(arrival - reader)
+    reference, base = _median(reader[in_order]), _median(arrival[in_order] - reader[in_order])
     since_s, delay_s = (reader - reference) * 1e-9, (arrival - reader - base) * 1e-9
-    usual = np.abs(delay_s - _running_median(delay_s)) < _LATE_S
-    if usual.sum() < 2:
-        usual[:] = True
-    drift, drift_interval, spread_s = _drift(since_s[usual], delay_s[usual])
-    if drift_interval is None:
-        raise RecordingError(_no_clock(reader[usual], arrival[usual], drift))
-    low, offset_s, high = _smallest(delay_s[usual] - drift * since_s[usual])
+    # The first time of arrival may be wrong and yet the smallest. At an end the median counts the values inside twice.
+    in_order &= delay_s > scipy.ndimage.median_filter(delay_s, 7, mode="mirror") - _LATE_S
+    line = _envelope_line(since_s[in_order], delay_s[in_order])
+    span_s = float(np.ptp(since_s[in_order]))
+    limit = MAX_DRIFT_PPM * 1e-6
+    if span_s < MIN_DRIFT_SPAN_S:  # there a drift is not fitted, and must not matter
+        limit = min(limit, 2 * MAX_UNCERTAINTY_S / max(span_s, 1e-9))
+    if line.low > limit or line.high < -limit:
+        raise RecordingError(_no_clock(reader[in_order], arrival[in_order], f"a drift of {1e6 * line.slope:.0f} ppm"))
+    if len(since_s) >= _GROUP_READS * _MIN_POINTS and line.spread_s > 2 * MAX_UNCERTAINTY_S:
+        raise RecordingError(
+            f"The smallest delays of arrival spread by {1e3 * line.spread_s:.0f} ms about a line; expected at most "
+            f"{2e3 * MAX_UNCERTAINTY_S:.0f} ms. One of the clocks does not run evenly: import with clock=arrival."
+        )
+    measured = span_s >= MIN_DRIFT_SPAN_S and line.num_points >= _MIN_POINTS
+    drift = line.slope if measured else 0.0
+    low, offset_s, high = _smallest(delay_s[in_order] - drift * since_s[in_order])
     late_s = delay_s - drift * since_s - offset_s
-    neighbours_s = np.maximum(_running_median(late_s), 0)
     piece = ClockPiece(
         reference_ns=reference,
         num_reads=len(reader),
         offset_s=offset_s + base * 1e-9,
         offset_interval_s=(low + base * 1e-9, high + base * 1e-9),
         drift_ppm=1e6 * drift,
-        drift_interval_ppm=(1e6 * drift_interval[0], 1e6 * drift_interval[1]) if drift_interval else None,
+        drift_interval_ppm=(1e6 * line.low, 1e6 * line.high) if measured else None,
     )
-    usable = (late_s > -_EARLY_S - 5 * spread_s) & (late_s < neighbours_s + _LATE_S)
-    known = len(delay_s) >= _MANY_READS or high - low <= MAX_UNCERTAINTY_S
-    return _Fit(piece, usable & known, spread_s)
+    is_known = high - low <= (MAX_UNCERTAINTY_S if high == offset_s else 3 * MAX_UNCERTAINTY_S)
+    return _Fit(piece, in_order & (late_s > -_EARLY_S) & is_known, line.spread_s)
 
 
-def _drift(since_s: np.ndarray, delay_s: np.ndarray) -> tuple[float, tuple[float, ...] | None, float]:
-    """The drift of the delays' lower envelope, its 95 % interval, and the envelope's spread in seconds.
+def _in_order(time_ns: np.ndarray, tolerance_s: float) -> np.ndarray:
+    """Rows whose time follows those before it: the longest sequence that never falls, and what is close to it.
 
-    The drift is 0 and its interval empty where the piece is too short; the interval is None where this is no clock.
+    A wrong time is out of order, whatever the delay of its arrival is.
     """
-    x, y = _envelope(since_s, delay_s)
-    if len(x) == 1:
-        return 0.0, (), 0.0
-    drift, _, low, high = map(float, scipy.stats.theilslopes(y, x))
-    residual_s = y - drift * x
+    ends: list[int] = []  # the smallest last time of a sequence of each length
+    length = np.empty(len(time_ns), int)
+    for row, time in enumerate(time_ns.tolist()):
+        place = bisect.bisect_right(ends, time)
+        ends[place : place + 1] = [time]
+        length[row] = place
+    kept = np.zeros(len(time_ns), bool)
+    wanted, latest = len(ends) - 1, np.iinfo(np.int64).max
+    for row in range(len(time_ns) - 1, -1, -1):
+        if length[row] == wanted and time_ns[row] <= latest:
+            kept[row], latest, wanted = True, time_ns[row], wanted - 1
+    rows, base = np.arange(len(time_ns)), _median(time_ns)
+    expected = np.interp(rows, rows[kept], (time_ns[kept] - base).astype(float))
+    return kept | (np.abs(time_ns - base - expected) <= tolerance_s * 1e9)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Line:
+    """The lower envelope of delays over time: Theil-Sen slope with its 95 % interval, and the spread about it in seconds."""
+
+    slope: float
+    low: float
+    high: float
+    spread_s: float
+    num_points: int
+
+
+def _envelope_line(since_s: np.ndarray, delay_s: np.ndarray) -> _Line:
+    """The line through the smallest delay of each of several groups of consecutive reads."""
+    count = int(np.clip(len(since_s) // _GROUP_READS, _MIN_POINTS, _MAX_POINTS))
+    count = min(count, max(1, len(since_s) // _MIN_GROUP_READS))
+    lowest = [group[np.argmin(delay_s[group])] for group in np.array_split(np.arange(len(since_s)), count)]
+    x, y = since_s[lowest], delay_s[lowest]
+    if count < 3 or np.ptp(x) == 0:
+        return _Line(0.0, -np.inf, np.inf, 0.0, count)
+    slope, _, low, high = map(float, scipy.stats.theilslopes(y, x))
+    residual_s = y - slope * x
     spread_s = _NORMAL * float(np.median(np.abs(residual_s - np.median(residual_s))))
-    span_s, limit = float(np.ptp(since_s)), MAX_DRIFT_PPM * 1e-6
-    if span_s >= MIN_DRIFT_SPAN_S:
-        return drift, (low, high) if abs(drift) <= limit else None, spread_s
-    limit = max(limit, _QUEUE_S / span_s)
-    return (drift, None, spread_s) if low > limit or high < -limit else (0.0, (), spread_s)
+    return _Line(slope, low, high, spread_s, count)
 
 
 def _smallest(delay_s: np.ndarray) -> tuple[float, float, float]:
-    """The delay that 1 % fall short of, between the ends of its 95 % interval; of less than 300 reads the smallest one.
+    """The smallest delay (of many reads, the one that 0.2 % fall short of) between the ends of its 95 % interval.
 
-    The interval of a quantile is by binomial ranks. That of the smallest of few delays takes them as uniform, from the
-    unknown smallest latency to twice their median.
+    The upper end is by binomial ranks. The lower one takes the delays as uniform, from the unknown smallest latency to twice
+    their median.
     """
     ordered = np.sort(delay_s)
     number = len(ordered)
-    if number >= _MANY_READS:
-        first, last = scipy.stats.binom.ppf([0.025, 0.975], number, 0.01).astype(int)
-        return float(ordered[max(0, first - 1)]), float(ordered[number // 100]), float(ordered[last])
+    rank = number // 500
+    upper = int(scipy.stats.binom.ppf(0.975, number, 0.002)) if rank else 0
     width_s = 2 * float(np.median(ordered) - ordered[0])
     lowest = float(ordered[0]) - width_s * (0.05 ** (-1 / max(1, number - 1)) - 1)
-    return lowest, float(ordered[0]), float(ordered[0])
+    return lowest, float(ordered[rank]), float(ordered[upper])
 
 
-def _envelope(since_s: np.ndarray, delay_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest delay of each of several groups of consecutive reads, and when it was; of all where they are few."""
-    count = min(len(since_s) // _BIN_READS, _MAX_BINS)
-    if count < _MIN_BINS:  # few reads: for a drift, which matters more in a long piece, or for an offset alone
-        count = _MIN_BINS if np.ptp(since_s) >= MIN_DRIFT_SPAN_S and len(since_s) >= 5 * _MIN_BINS else 1
-    lowest = [group[np.argmin(delay_s[group])] for group in np.array_split(np.arange(len(since_s)), count)]
-    return since_s[lowest], delay_s[lowest]
-
-
-def _no_clock(reader: np.ndarray, arrival: np.ndarray, drift: float) -> str:
+def _no_clock(reader: np.ndarray, arrival: np.ndarray, found: str) -> str:
     reader_s, host_s = (reader[-1] - reader[0]) * 1e-9, (arrival[-1] - arrival[0]) * 1e-9
     return (
-        f"The reader's clock advances by {reader_s:.6g} s while the host's advances by {host_s:.6g} s (drift {1e6 * drift:.0f} "
-        f"ppm); expected a difference of at most {MAX_DRIFT_PPM:.0f} ppm. A wrong unit, or a clock that does not run: import "
-        "with clock=arrival."
+        f"The reader's clock advances by {reader_s:.6g} s while the host's advances by {host_s:.6g} s ({found}); expected a drift of "
+        f"at most {MAX_DRIFT_PPM:.0f} ppm, and of {2e3 * MAX_UNCERTAINTY_S:.0f} ms in less than a minute. A wrong unit, or a clock "
+        "that does not run: import with clock=arrival."
     )
-
-
-def _running_median(values: np.ndarray) -> np.ndarray:
-    """The median of seven neighbours; at an end the values inside count twice, so that a wrong first row stands out."""
-    return scipy.ndimage.median_filter(values, 7, mode="mirror")
 
 
 def _median(values: np.ndarray) -> int:

@@ -3,23 +3,73 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.ndimage
 
 _WINDOW = 31  # reads on each side of a boundary that are compared
 _MIN_JUMP_S = 0.02
 _MAX_DRIFT = 1e-3
+_MAX_QUEUE_S = 10.0  # arrivals are held up for so long at most, where only a few are
 
 
 def continuous_pieces(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> list[np.ndarray]:
-    """Rows, in order of arrival, of each piece of a table in which neither clock was set anew; every row is in one piece.
+    """Rows, in order of arrival, of each piece of a table in which neither clock was set anew.
 
-    Arrivals that were held up and then come at once also raise the delay, but only for a while, and the reader's times
-    go on: these rows stay in one piece.
+    Arrivals that were held up and then come at once also raise the delay, but only for a while: these rows stay in one
+    piece. Rows of no piece have a wrong time: a few in a row whose delay differs from all around by more than `_MAX_QUEUE_S`.
     """
     delay_ns = arrival_ns - reader_ns
     delay_s = (delay_ns - np.partition(delay_ns, len(delay_ns) // 2)[len(delay_ns) // 2]) * 1e-9
-    cuts, threshold_s = _jumps(delay_s)
+    cuts, threshold_s = _jumps(_without_single(delay_s))
     pieces = np.split(np.arange(len(delay_s)), cuts)
-    return _without_short(_without_queues(pieces, reader_ns, arrival_ns, delay_s, threshold_s), reader_ns)
+    levels = [_low(delay_s[rows]) for rows in pieces]
+    window = _window(len(delay_s))
+    is_long = [2 * len(rows) >= window and not _is_brief(rows, arrival_ns, window) for rows in pieces]
+    groups: list[list[int]] = []  # long pieces of one clock
+    for piece in np.flatnonzero(is_long):
+        since = groups[-1][-1] if groups else piece
+        gap_s = abs(int(arrival_ns[pieces[piece][0]]) - int(arrival_ns[pieces[since][-1]])) * 1e-9
+        if groups and abs(levels[piece] - levels[since]) <= threshold_s + _MAX_DRIFT * gap_s:
+            groups[-1].append(int(piece))
+        else:
+            groups.append([int(piece)])
+    groups = _without_queues(groups, levels, threshold_s)
+    if not groups:
+        return [np.arange(len(delay_s))]
+    for piece in np.flatnonzero(
+        ~np.array(is_long)
+    ):  # a few reads belong to the clock whose delays are most like theirs
+        group = min(groups, key=lambda one: abs(levels[one[0]] - levels[piece]))
+        beside = group[0] - 1 <= piece <= group[-1] + 1
+        if beside and abs(levels[group[0]] - levels[piece]) <= _MAX_QUEUE_S:
+            group.append(int(piece))
+    return [np.concatenate([pieces[piece] for piece in sorted(group)]) for group in groups]
+
+
+def _without_single(delay_s: np.ndarray) -> np.ndarray:
+    """The delays, with the median of their neighbours in place of single ones that are far too small."""
+    usual_s = scipy.ndimage.median_filter(delay_s, 7, mode="mirror")
+    below_s = usual_s - delay_s
+    return np.where(below_s > 10 * np.median(np.abs(below_s)) + _MIN_JUMP_S, usual_s, delay_s)
+
+
+def _without_queues(groups: list[list[int]], levels: list[float], threshold_s: float) -> list[list[int]]:
+    """Groups joined where the delay, after it was larger for a while, is what it was before."""
+    joined: list[list[int]] = []
+    while groups:
+        group, groups = groups[0], groups[1:]
+        for number, later in enumerate(groups):
+            if levels[later[0]] < levels[group[0]] - threshold_s:
+                break
+            if abs(levels[later[0]] - levels[group[0]]) <= threshold_s:
+                group = group + [piece for one in groups[: number + 1] for piece in one]
+                groups = groups[number + 1 :]
+                break
+        joined.append(group)
+    return joined
+
+
+def _is_brief(rows: np.ndarray, arrival_ns: np.ndarray, window: int) -> bool:
+    return len(rows) < 2 * window and int(np.ptp(arrival_ns[rows])) < 10**9
 
 
 def _window(num_rows: int) -> int:
@@ -52,41 +102,3 @@ def _jumps(delay_s: np.ndarray) -> tuple[np.ndarray, float]:
         cost = np.r_[0.0, np.cumsum(np.abs(rows - before) - np.abs(rows - after))]
         cuts.add(int(start + np.argmin(cost)))
     return np.array(sorted(cuts - {0, num_rows}), int), threshold_s
-
-
-def _without_queues(
-    pieces: list[np.ndarray], reader_ns: np.ndarray, arrival_ns: np.ndarray, delay_s: np.ndarray, threshold_s: float
-) -> list[np.ndarray]:
-    """Pieces joined where the delay, after it was larger for a while, is what it was before."""
-    levels = [_low(delay_s[rows]) for rows in pieces]
-    joined: list[np.ndarray] = []
-    first = 0
-    while first < len(pieces):
-        last = first
-        for piece in range(first + 1, len(pieces)):
-            start = pieces[piece][0]
-            if reader_ns[start] - reader_ns[start - 1] < -threshold_s * 1e9:
-                break  # the reader's clock was set back
-            gap_s = abs(int(arrival_ns[start]) - int(arrival_ns[pieces[first][-1]])) * 1e-9
-            if abs(levels[piece] - levels[first]) <= threshold_s + _MAX_DRIFT * gap_s:
-                last = piece
-            elif levels[piece] < levels[first]:
-                break
-        joined.append(np.concatenate(pieces[first : last + 1]))
-        first = last + 1
-    return joined
-
-
-def _without_short(pieces: list[np.ndarray], reader_ns: np.ndarray) -> list[np.ndarray]:
-    """Pieces without those that are too short for a clock of their own: these rows go to the piece before, or after."""
-    window = _window(sum(map(len, pieces)))
-
-    def is_short(rows: np.ndarray) -> bool:
-        return 2 * len(rows) < window or (len(rows) < 2 * window and int(np.ptp(reader_ns[rows])) < 10**9)
-
-    kept: list[list[np.ndarray]] = [[]]
-    for rows in pieces:
-        if kept[-1] and not is_short(rows) and not all(map(is_short, kept[-1])):
-            kept.append([])
-        kept[-1].append(rows)
-    return [np.concatenate(group) for group in kept]

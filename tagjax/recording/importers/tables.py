@@ -228,8 +228,9 @@ def _times(reads: list[Read], clock: str | float, rate_hz: float, notes: list[st
         )
         notes.append(f"no times in the table: set in order at {rate_hz:g} reads/s per tag")
         return _Times(np.array(stamps, np.int64), all_rows, None, None, None)
-    if reader is not None and reader_epoch(reader) != "unix":
-        note = f"the reader's clock was never set: it started in {reader_epoch(reader)}"
+    # One wrong time does not make a clock that was never set.
+    if reader is not None and (epoch := reader_epoch(np.sort(reader)[len(reader) // 10 :])) != "unix":
+        note = f"the reader's clock was never set: it started in {epoch}"
         warnings.warn(note[0].upper() + note[1:] + ".", RecordingWarning, stacklevel=4)
         notes.append(note)
     compared = _compare_clocks(reader, arrival, required=clock == "auto", notes=notes)
@@ -286,7 +287,8 @@ def _clock_notes(audit: ClockAudit) -> list[str]:
             f"{drift}"
         )
     if len(audit.pieces) > 1:
-        notes.append(f"a clock was set anew or restarted {len(audit.pieces) - 1} times")
+        count = len(audit.pieces) - 1
+        notes.append(f"a clock was set anew or restarted {count} time{'s' if count > 1 else ''}")
     return notes
 
 
