@@ -232,15 +232,15 @@ def test_a_channel_is_held_for_a_fifth_of_a_second(static):
 
 
 def test_the_clock_is_recovered(static):
-    """Offset to the latency of 5 to 50 ms, and drift; corrected times run with the host's."""
+    """Offset to the latency of 5 to 50 ms. A recording of less than a minute gets no drift: 42 ppm are 2 ms then."""
     assert static.clock is not None
     assert static.reads.reader_time_ns is not None
     (piece,) = static.clock.pieces
-    np.testing.assert_allclose(piece.drift_ppm, 42.0, atol=8.0)
-    drifted_s = 42e-6 * (piece.reference_ns - static.reads.reader_time_ns[0]) * 1e-9
-    np.testing.assert_allclose(piece.offset_s - drifted_s, 0.37 + 0.006, atol=0.004)
-    ran = np.diff(static.reads.time_ns[[0, -1]])[0] / np.diff(static.reads.reader_time_ns[[0, -1]])[0]
-    np.testing.assert_allclose(ran - 1, 42e-6, atol=8e-6)
+    assert piece.drift_interval_ppm is None
+    ran_s = (piece.reference_ns - static.reads.reader_time_ns[0]) * 1e-9
+    np.testing.assert_allclose(piece.offset_s - 42e-6 * ran_s, 0.37 + 0.006, atol=0.004)
+    moved_ns = static.reads.time_ns - static.reads.reader_time_ns
+    np.testing.assert_array_equal(moved_ns, round(piece.offset_s * 1e9))
 
 
 def test_corrected_times_fit_the_motion():

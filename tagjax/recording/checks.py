@@ -21,6 +21,7 @@ MAX_OUTSIDE = 0.5
 """A recording is refused if a larger fraction of its reads lies outside of the video's time."""
 
 _WARN_OUTSIDE = 0.05
+_MARGIN_NS = 500_000_000  # a reader starts and ends a little before or after the camera
 _MAX_LABEL = 254  # 255 is ignored
 
 
@@ -60,9 +61,7 @@ def check_geometry(recording: Recording) -> None:
 def check_time_of_reads(recording: Recording) -> None:
     """Raise `RecordingError` if most reads lie outside of the video's time; warn if some do."""
     reads, time_ns = recording.reads, recording.time_ns
-    if recording.num_frames < 2:
-        return
-    outside = float(np.mean((reads.time_ns < time_ns[0]) | (reads.time_ns > time_ns[-1])))
+    outside = float(np.mean((reads.time_ns < time_ns[0] - _MARGIN_NS) | (reads.time_ns > time_ns[-1] + _MARGIN_NS)))
     if outside <= _WARN_OUTSIDE:
         return
     first_s, last_s = ((int(stamp) - int(time_ns[0])) * 1e-9 for stamp in (reads.time_ns.min(), reads.time_ns.max()))
