@@ -87,6 +87,35 @@ def test_two_texts_never_share_a_file_name(texts):
     assert safe_file_name(texts[0]) != safe_file_name(texts[1])
 
 
+@pytest.mark.parametrize("name", ["walkers-people-test-0", "E2801191", "a-c14cddc", "con-1", "Größe", "console.txt"])
+def test_an_ordinary_name_stays_as_it_is_in_files(name):
+    assert safe_file_name(name) == name
+
+
+@pytest.mark.parametrize("text", ["a/b", "x" * 300, "con", "é" * 50])
+def test_a_text_that_looks_like_a_file_name_of_another_does_not_share_it(text):
+    assert safe_file_name(safe_file_name(text)) != safe_file_name(text)
+
+
+@pytest.mark.parametrize("text", ["\u00e9" * 100, "\u4e2d" * 100, "\U00020000" * 100, "x" + "\u00e9" * 100])
+def test_a_file_name_is_limited_in_bytes(text):
+    name = safe_file_name(text)
+    assert len(name.encode()) <= 90
+    assert text.startswith(name.rpartition("-")[0])
+    assert len(name.rpartition("-")[0].encode()) >= 77
+
+
+@pytest.mark.parametrize("text", ["con", "NUL", "Com1", "lpt9.txt", "aux.a.b", "prn.", "com\u00b9"])
+def test_no_file_name_is_a_device_of_windows(text):
+    assert safe_file_name(text).startswith("_")
+    assert safe_file_name(text).partition(".")[0].lower() != text.partition(".")[0].lower()
+
+
+@pytest.mark.parametrize("text", ["-x", "+", "-"])
+def test_a_name_made_of_a_text_begins_as_names_do(text):
+    assert name_fault(valid_name(text)) is None
+
+
 def test_a_formula_is_a_text_in_a_csv_file(tmp_path):
     row = ["=1+1", "+a", "@x", "-2.5", "-1e-05", "nan", "-inf", 3, None, "plain"]
     write_csv(tmp_path / "a.csv", [str(k) for k in range(len(row))], [row])

@@ -25,6 +25,7 @@ import synthetic_clips as synthetic
 from test_main_job import _values
 from test_resume import NUM_STEPS, _environment, _finish, _same, _steps_logged, _train
 
+from tagjax.core import files
 from tagjax.core.files import WriteError, atomic_path, write_atomic
 from tagjax.core.folder_lock import FolderLockedError, locked_folder
 from tagjax.core.interruption import Terminated
@@ -348,7 +349,8 @@ def test_pictures_and_figures_that_do_not_fit_leave_the_earlier_ones(tmp_path: P
     script = """
         from pathlib import Path
         import numpy as np
-        from tagjax.core.files import WriteError
+        from tagjax.core import files
+from tagjax.core.files import WriteError
         from tagjax.flow.flo_files import write_flo
         from tagjax.recording.image_files import write_image
         from tagjax.report.figure import blank, save_figure
@@ -397,7 +399,8 @@ def test_a_run_on_a_full_disk_ends_in_one_line_and_resumes(scene: str, tmp_path:
 def test_a_full_disk_leaves_the_checkpoints_before_it(tmp_path: Path) -> None:
     script = """
         import equinox as eqx, jax, jax.numpy as jnp
-        from tagjax.core.files import WriteError
+        from tagjax.core import files
+from tagjax.core.files import WriteError
         from tagjax.training.checkpoint import Checkpoints
 
         class State(eqx.Module):
@@ -615,3 +618,58 @@ def test_a_half_written_file_that_is_visible_is_found(tmp_path: Path) -> None:
     assert differences(recording_contents(tmp_path / "b"), whole, complete=True) == "two.png is missing"
     (tmp_path / "b" / "two.png").write_bytes((tmp_path / "a" / "two.png").read_bytes()[:-1])
     assert differences(recording_contents(tmp_path / "b"), whole, complete=False) == "two.png differs"
+
+
+def test_only_partial_files_of_this_machine_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two machines whose names begin alike, or containers with one name, write to the same folder."""
+    ended = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+
+    def left_by(name: str) -> Path:
+        monkeypatch.setattr(socket, "gethostname", lambda: name)
+        files._machine.cache_clear()
+        with atomic_path(tmp_path / "a.json") as partial:
+            partial.touch()
+            found = partial.with_name(partial.name.replace(f"-{os.getpid()}-", f"-{ended.stdout.strip()}-"))
+        found.touch()
+        return found
+
+    try:
+        other, mine = left_by("gpu-cluster-node-01"), left_by("gpu-cluster-node-02")
+        assert (other.exists(), mine.exists()) == (True, True)
+        write_atomic(tmp_path / "a.json", "b")
+        assert (other.exists(), mine.exists()) == (True, False)
+    finally:
+        monkeypatch.undo()
+        files._machine.cache_clear()
+
+
+def test_partial_files_of_another_container_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    digests = set()
+    for namespace in ("pid:[1]", "pid:[2]"):
+        monkeypatch.setattr(files.os, "readlink", lambda path, namespace=namespace: namespace)
+        files._machine.cache_clear()
+        digests.add(files._machine())
+    files._machine.cache_clear()
+    assert len(digests) == 2
+
+
+@pytest.mark.parametrize("process", ["9" * 30, "\u00b2", "x", ""])
+def test_a_partial_file_with_an_odd_process_number_is_kept(process: str, tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "a.json") as partial:
+        partial.touch()
+        odd = partial.with_name(partial.name.replace(f"-{os.getpid()}-", f"-{process}-"))
+        odd.touch()
+    write_atomic(tmp_path / "a.json", "b")
+    assert odd.exists()
+
+
+@pytest.mark.parametrize("name", ["x" * 255, "\u00e9" * 127, "x" + "\u4e2d" * 84], ids=["x", "two_bytes", "three_bytes"])
+def test_the_longest_name_of_a_file_can_be_written(name: str, tmp_path: Path) -> None:
+    write_atomic(tmp_path / name, "a")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_name_that_is_too_long_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(WriteError, match="File name too long. Choose a shorter name"):
+        write_atomic(tmp_path / ("x" * 256), "a")
+    assert list(tmp_path.iterdir()) == []
