@@ -569,7 +569,7 @@ def test_a_folder_in_use_is_refused_with_the_process_until_that_is_killed(
         pass
 
 
-@pytest.mark.parametrize("command", ["train", "train_flow"])
+@pytest.mark.parametrize("command", ["train", "train_flow", "evaluate", "sweep_paper", "simulate"])
 def test_a_second_run_in_a_folder_ends_in_one_line_and_changes_nothing(
     command: str, holder: subprocess.Popen[str], scene: str, tmp_path: Path
 ) -> None:
