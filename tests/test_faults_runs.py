@@ -342,8 +342,7 @@ def test_pictures_and_figures_that_do_not_fit_leave_the_earlier_ones(tmp_path: P
     script = """
         from pathlib import Path
         import numpy as np
-        from tagjax.core import files
-from tagjax.core.files import WriteError
+        from tagjax.core.files import WriteError
         from tagjax.flow.flo_files import write_flo
         from tagjax.recording.image_files import write_image
         from tagjax.report.figure import blank, save_figure
@@ -380,7 +379,7 @@ def test_a_run_on_a_full_disk_ends_in_one_line_and_resumes(scene: str, tmp_path:
     metrics = (straight / "metrics.jsonl").stat().st_size
     command = _train(scene, broken)
     limited = [sys.executable, "-c", f"{SMALL_FILES}\nimport tagjax.cli; tagjax.cli.train()", str(3 * metrics // 4)]
-    process = _start([*limited, *command[3:], "hydra.output_subdir=null"], JAX_ENABLE_COMPILATION_CACHE="false")
+    process = _start([*limited, *command[3:]], JAX_ENABLE_COMPILATION_CACHE="false")
     error = process.communicate(timeout=400)[1]
     assert process.returncode == 1
     assert re.fullmatch(rf"train: {broken}/metrics.jsonl could not be written: File too large\. [^\n]+", error.strip())
@@ -392,8 +391,7 @@ def test_a_run_on_a_full_disk_ends_in_one_line_and_resumes(scene: str, tmp_path:
 def test_a_full_disk_leaves_the_checkpoints_before_it(tmp_path: Path) -> None:
     script = """
         import equinox as eqx, jax, jax.numpy as jnp
-        from tagjax.core import files
-from tagjax.core.files import WriteError
+        from tagjax.core.files import WriteError
         from tagjax.training.checkpoint import Checkpoints
 
         class State(eqx.Module):
