@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 from collections.abc import Callable, Mapping
@@ -11,6 +12,8 @@ from typing import Any, TypeVar
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+
+from tagjax.core.folder_lock import locked_folder
 
 from .errors import ending_in_one_line, errors_in_one_line
 from .help import command_help
@@ -26,14 +29,18 @@ OmegaConf.register_new_resolver("command_help", functools.partial(command_help, 
 def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], None]:
     """The entry point of a module `experiments/<name>.py`, configured by Hydra from conf/<name>.yaml.
 
-    `function` receives the configuration as plain values and the run folder. A number that it returns is a sweep's objective.
+    `function` receives the configuration as plain values and the run folder, whose lock it holds. A number that it returns
+    is a sweep's objective. A command that can run in several processes (`distributed`) has them share the folder, so it takes
+    the lock itself in the process that writes.
     """
     name = Path(function.__code__.co_filename).stem
 
     @functools.wraps(function)
     def run(config: DictConfig) -> Any:
         with errors_in_one_line(name):
-            return function(plain_values(config), Path(HydraConfig.get().runtime.output_dir))
+            values, folder = plain_values(config), Path(HydraConfig.get().runtime.output_dir)
+            with contextlib.nullcontext() if "distributed" in values else locked_folder(folder):
+                return function(values, folder)
 
     configured = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(run)
 

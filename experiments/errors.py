@@ -17,7 +17,9 @@ from tagjax.core.interruption import exit_status, interruption, last_signal, mes
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 
-TRACEBACK_WANTED = os.environ.get(_FULL_ERROR, "0") not in ("", "0")
+_USER_VALUE = os.environ.get(_FULL_ERROR)
+
+TRACEBACK_WANTED = (_USER_VALUE or "0") != "0"
 """Whether the user wants tracebacks (HYDRA_FULL_ERROR=1); read once, because `ending_in_one_line` sets the variable."""
 
 
@@ -29,7 +31,8 @@ def errors_in_one_line(command: str, *more: type[Exception]) -> Iterator[None]:
     from others. An error that follows from Ctrl-C or SIGTERM becomes the exception of that signal.
     """
     try:
-        yield
+        with _full_error(_USER_VALUE):  # programs that the command starts inherit the user's value
+            yield
     except Exception as error:
         if (number := last_signal()) is not None:
             raise interruption(number) from error
@@ -42,9 +45,11 @@ def errors_in_one_line(command: str, *more: type[Exception]) -> Iterator[None]:
 def ending_in_one_line(command: str) -> Iterator[None]:
     """For the whole of a command, with Hydra's part: Ctrl-C and SIGTERM end it in one line, with status 130 and 143.
 
-    A run folder that Hydra cannot write ends it in one line as well, with status 1.
+    A run folder that Hydra cannot write and an error of a sweep's job that the user can correct (`ValueError`, `OSError`)
+    end it in one line as well, with status 1.
     """
-    with raise_on_signals(), _hydra_raises_errors():
+    # By default Hydra prints the traceback of an error in its own code and ends the process itself.
+    with raise_on_signals(), _full_error("1"):
         try:
             yield
         except KeyboardInterrupt as error:
@@ -61,9 +66,11 @@ def ending_in_one_line(command: str) -> Iterator[None]:
                 refused = (
                     error
                     if isinstance(error, WriteError)
-                    else WriteError(error.filename or "Hydra's part of the run folder (.hydra)", number)
+                    else WriteError(error.filename or "Hydra's part of the run folder", number)
                 )
                 raise SystemExit(f"{command}: {refused}") from error
+            if isinstance(error, (ValueError, OSError)):
+                raise SystemExit(f"{command}: {error}") from error
             raise
 
 
@@ -73,17 +80,21 @@ def _ended(command: str, number: int) -> SystemExit:
 
 
 @contextlib.contextmanager
-def _hydra_raises_errors() -> Iterator[None]:
-    """By default Hydra prints the traceback of an error in its own code and ends the process itself."""
+def _full_error(value: str | None) -> Iterator[None]:
+    """Within the block HYDRA_FULL_ERROR has a value; None: it is not set."""
     before = os.environ.get(_FULL_ERROR)
-    os.environ[_FULL_ERROR] = "1"
+    _set_full_error(value)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[_FULL_ERROR]
-        else:
-            os.environ[_FULL_ERROR] = before
+        _set_full_error(before)
+
+
+def _set_full_error(value: str | None) -> None:
+    if value is None:
+        os.environ.pop(_FULL_ERROR, None)
+    else:
+        os.environ[_FULL_ERROR] = value
 
 
 def sweeping() -> bool:

@@ -10,7 +10,9 @@ import yaml
 
 from .command import write_config
 
-_MAX_BYTES = 1_000_000
+_MAX_BYTES = 64_000
+_MAX_DEPTH = 32
+"""Of the configurations of this package the largest has 7 kB and 5 levels."""
 
 _MAY_DIFFER = (
     "loop",
@@ -56,8 +58,8 @@ def keep_configuration(folder: Path, values: Mapping[str, Any]) -> None:
 def read_configuration(path: Path) -> dict[str, Any]:
     """The plain values of a run folder's config.yaml, which may come from elsewhere: nothing in it is interpreted.
 
-    Raises `ValueError` for a file that is missing, too large or no YAML mapping, and for interpolations (`${...}`) and
-    YAML aliases, which the commands never write.
+    Raises `ValueError` for a file that is missing, too large, too deeply nested or no YAML mapping, and for interpolations
+    (`${...}`), YAML aliases and YAML tags (`!!set`), which the commands never write.
     """
     expected = "expected the config.yaml of a run folder, as `python -m experiments.train` writes it."
     try:
@@ -65,19 +67,29 @@ def read_configuration(path: Path) -> dict[str, Any]:
             text = file.read(_MAX_BYTES + 1)
         if len(text) > _MAX_BYTES:
             raise ValueError(f"more than {_MAX_BYTES} bytes")
-        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
-            if isinstance(event, yaml.AliasEvent):
-                raise ValueError(f"the alias *{event.anchor}")
-            if isinstance(event, yaml.ScalarEvent) and "${" in event.value:
-                raise ValueError(f"the interpolation {event.value[:60]!r}")
+        _check_events(text)
         values = yaml.safe_load(text)
-    except RecursionError:
-        raise ValueError(f"{path}: found too deep a nesting; {expected}") from None
-    except (OSError, ValueError, OverflowError, yaml.YAMLError) as error:
+    # PyYAML raises whatever the conversion of a text raises: `0b_` as an integer, 2001-99-99 as a date.
+    except (OSError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError, yaml.YAMLError) as error:
         raise ValueError(f"{path}: found {' '.join(str(error).split())}; {expected}") from error
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise ValueError(f"{path}: found {type(values).__name__} that is no mapping of names; {expected}")
     return values
+
+
+def _check_events(text: bytes) -> None:
+    """Raise `ValueError` for what no command writes, as soon as it is met: the parser's time grows with the depth."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"the alias *{event.anchor}")
+        if isinstance(event, yaml.ScalarEvent) and "${" in event.value:
+            raise ValueError(f"the interpolation {event.value[:60]!r}")
+        if isinstance(event, yaml.NodeEvent) and getattr(event, "tag", None) is not None:
+            raise ValueError(f"the tag {event.tag[:60]!r}")  # type: ignore[attr-defined]
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _MAX_DEPTH:
+            raise ValueError(f"more than {_MAX_DEPTH} levels")
 
 
 def checkpoint_steps(folder: Path) -> list[int]:

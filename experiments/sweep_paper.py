@@ -21,7 +21,6 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> float:
     from rich.console import Console
 
-    from tagjax.core.folder_lock import locked_folder
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.sweep import SweepConfig, run_sweep, table
 
@@ -35,9 +34,8 @@ def main(values: dict[str, Any], folder: Path) -> float:
         def report(done: int, total: int, name: str) -> None:
             bar.update(task, completed=done, total=total or None, description=name)
 
-        with locked_folder(folder):
-            write_config(values, folder)
-            rows = table(run_sweep(config, folder, on_progress=report))
+        write_config(values, folder)
+        rows = table(run_sweep(config, folder, on_progress=report))
     console.print((folder / "table.md").read_text(), soft_wrap=True, highlight=False)
     console.print(f"table.md, table.csv, sweep.png, lines.jsonl in {folder}", soft_wrap=True, highlight=False)
     print_result(rows)

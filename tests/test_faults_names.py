@@ -8,6 +8,7 @@ import os
 
 import numpy as np
 import pytest
+import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -87,6 +88,35 @@ def test_two_texts_never_share_a_file_name(texts):
     assert safe_file_name(texts[0]) != safe_file_name(texts[1])
 
 
+@pytest.mark.parametrize("name", ["walkers-people-test-0", "E2801191", "a-c14cddc", "con-1", "Größe", "console.txt"])
+def test_an_ordinary_name_stays_as_it_is_in_files(name):
+    assert safe_file_name(name) == name
+
+
+@pytest.mark.parametrize("text", ["a/b", "x" * 300, "con", "é" * 50])
+def test_a_text_that_looks_like_a_file_name_of_another_does_not_share_it(text):
+    assert safe_file_name(safe_file_name(text)) != safe_file_name(text)
+
+
+@pytest.mark.parametrize("text", ["\u00e9" * 100, "\u4e2d" * 100, "\U00020000" * 100, "x" + "\u00e9" * 100])
+def test_a_file_name_is_limited_in_bytes(text):
+    name = safe_file_name(text)
+    assert len(name.encode()) <= 90
+    assert text.startswith(name.rpartition("-")[0])
+    assert len(name.rpartition("-")[0].encode()) >= 77
+
+
+@pytest.mark.parametrize("text", ["con", "NUL", "Com1", "lpt9.txt", "aux.a.b", "prn.", "com\u00b9"])
+def test_no_file_name_is_a_device_of_windows(text):
+    assert safe_file_name(text).startswith("_")
+    assert safe_file_name(text).partition(".")[0].lower() != text.partition(".")[0].lower()
+
+
+@pytest.mark.parametrize("text", ["-x", "+", "-"])
+def test_a_name_made_of_a_text_begins_as_names_do(text):
+    assert name_fault(valid_name(text)) is None
+
+
 def test_a_formula_is_a_text_in_a_csv_file(tmp_path):
     row = ["=1+1", "+a", "@x", "-2.5", "-1e-05", "nan", "-inf", 3, None, "plain"]
     write_csv(tmp_path / "a.csv", [str(k) for k in range(len(row))], [row])
@@ -164,6 +194,9 @@ FAULTS = {
     "phase sign": (lambda r: _reads(r, phase_sign=0), "phase_sign is 0; expected 1"),
     "phase period": (lambda r: _reads(r, phase_period_rad=360.0), "phase_period_rad is 360.0; expected radians"),
     "phase period not finite": (lambda r: _reads(r, phase_period_rad=float("nan")), "phase_period_rad is nan"),
+    "phase period as a boolean": (lambda r: _reads(r, phase_period_rad=True), "phase_period_rad is True"),
+    "flips as a number": (lambda r: _reads(r, pi_flips=1), "pi_flips is 1; expected true, false, or null"),
+    "flips as a text": (lambda r: _reads(r, pi_flips="no"), "pi_flips is 'no'"),
     "hop table in MHz": (lambda r: _reads(r, hop_table_hz=(920.0,)), "hop_table_hz is .920.0.*in Hz"),
     "times of reads as floats": (
         lambda r: _reads(r, time_ns=r.reads.time_ns.astype(float)),
@@ -241,3 +274,37 @@ def test_the_trials_of_names_and_targets(tmp_path):
     for outcome in (*names.trial(300, 1, tmp_path), *targets.trial(1200, 1, tmp_path)):
         assert outcome.failed == 0, outcome
         assert outcome.tried == 300
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: one.update(epcs=one["epcs"][:-1]), "reads/epc holds 0 to 1 .*; expected integers from 0 to 0"),
+        (lambda one: one.update(epcs=[]), "reads/epc holds"),
+        (lambda one: one.update(epcs=[1, 2]), "epcs is .1, 2.; expected a list of texts"),
+        (lambda one: one.update(epcs="ab"), "epcs is ab; expected a list of texts"),
+        (lambda one: one.update(name=5), "name is 5; expected a text"),
+        (lambda one: one.update(source=None), "source is None; expected a text"),
+        (lambda one: one["reads"].update(pi_flips="no"), "pi_flips"),
+        (lambda one: one["reads"].update(phase_period_rad=True), "phase_period_rad"),
+    ],
+)
+def test_attributes_of_another_type_are_refused(recording, tmp_path, change, message):
+    epcs = np.where(np.arange(recording.reads.num_reads) % 2, "tag-a", "tag-b")
+    reads = dataclasses.replace(recording.reads, epc=epcs)
+    save_recording(recording.with_reads(reads), tmp_path / "a.zarr")
+    path = tmp_path / "a.zarr" / "zarr.json"
+    stored = json.loads(path.read_text())
+    change(stored["attributes"])
+    path.write_text(json.dumps(stored))
+    with pytest.raises(RecordingError, match=message):
+        open_recording(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("index", [-1, 5, 2**31 - 1])
+def test_an_index_outside_of_the_list_of_epcs_is_refused(recording, tmp_path, index):
+    save_recording(recording, tmp_path / "a.zarr")
+    array = zarr.open_group(str(tmp_path / "a.zarr"), mode="r+")["reads/epc"]
+    array[0] = index
+    with pytest.raises(RecordingError, match=f"reads/epc holds .*{index}.*expected integers from 0 to"):
+        open_recording(tmp_path / "a.zarr")

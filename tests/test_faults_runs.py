@@ -25,6 +25,7 @@ import synthetic_clips as synthetic
 from test_main_job import _values
 from test_resume import NUM_STEPS, _environment, _finish, _same, _steps_logged, _train
 
+from tagjax.core import files
 from tagjax.core.files import WriteError, atomic_path, write_atomic
 from tagjax.core.folder_lock import FolderLockedError, locked_folder
 from tagjax.core.interruption import Terminated
@@ -32,6 +33,7 @@ from tagjax.core.settings import from_mapping
 from tagjax.flow import cache
 from tagjax.recording.image_files import write_image
 from tagjax.recording.store import save_recording
+from tagjax.training import loop
 from tagjax.training import run as run_module
 from tagjax.training.config import TrainConfig
 from tagjax.training.loop import TrainingResult
@@ -42,14 +44,6 @@ STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 TEXT = {signal.SIGINT: "interrupted by Ctrl-C.", signal.SIGTERM: "ended by SIGTERM."}
 NO_WARNINGS = {"PYTHONWARNINGS": "ignore"}  # of a recording without reads
 both_signals = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl_c", "sigterm"])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _ctrl_c_reaches_programs() -> Iterator[None]:
-    """In the background a shell ignores Ctrl-C, and programs inherit that."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")
@@ -385,7 +379,7 @@ def test_a_run_on_a_full_disk_ends_in_one_line_and_resumes(scene: str, tmp_path:
     metrics = (straight / "metrics.jsonl").stat().st_size
     command = _train(scene, broken)
     limited = [sys.executable, "-c", f"{SMALL_FILES}\nimport tagjax.cli; tagjax.cli.train()", str(3 * metrics // 4)]
-    process = _start([*limited, *command[3:], "hydra.output_subdir=null"], JAX_ENABLE_COMPILATION_CACHE="false")
+    process = _start([*limited, *command[3:]], JAX_ENABLE_COMPILATION_CACHE="false")
     error = process.communicate(timeout=400)[1]
     assert process.returncode == 1
     assert re.fullmatch(rf"train: {broken}/metrics.jsonl could not be written: File too large\. [^\n]+", error.strip())
@@ -573,7 +567,7 @@ def test_a_folder_in_use_is_refused_with_the_process_until_that_is_killed(
         pass
 
 
-@pytest.mark.parametrize("command", ["train", "train_flow"])
+@pytest.mark.parametrize("command", ["train", "train_flow", "evaluate", "sweep_paper", "simulate"])
 def test_a_second_run_in_a_folder_ends_in_one_line_and_changes_nothing(
     command: str, holder: subprocess.Popen[str], scene: str, tmp_path: Path
 ) -> None:
@@ -586,6 +580,7 @@ def test_a_second_run_in_a_folder_ends_in_one_line_and_changes_nothing(
     assert error.startswith(f"{command}: {tmp_path / 'run'} is in use: process {holder.pid} on ")
     assert len(error.strip().splitlines()) == 1
     assert config.read_text() == "of: the first run\n"
+    assert not (tmp_path / "run" / ".hydra").exists()
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
@@ -615,3 +610,153 @@ def test_a_half_written_file_that_is_visible_is_found(tmp_path: Path) -> None:
     assert differences(recording_contents(tmp_path / "b"), whole, complete=True) == "two.png is missing"
     (tmp_path / "b" / "two.png").write_bytes((tmp_path / "a" / "two.png").read_bytes()[:-1])
     assert differences(recording_contents(tmp_path / "b"), whole, complete=False) == "two.png differs"
+
+
+def test_only_partial_files_of_this_machine_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two machines whose names begin alike, or containers with one name, write to the same folder."""
+    ended = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+
+    def left_by(name: str) -> Path:
+        monkeypatch.setattr(socket, "gethostname", lambda: name)
+        files._machine.cache_clear()
+        with atomic_path(tmp_path / "a.json") as partial:
+            partial.touch()
+            found = partial.with_name(partial.name.replace(f"-{os.getpid()}-", f"-{ended.stdout.strip()}-"))
+        found.touch()
+        return found
+
+    try:
+        other, mine = left_by("gpu-cluster-node-01"), left_by("gpu-cluster-node-02")
+        assert (other.exists(), mine.exists()) == (True, True)
+        write_atomic(tmp_path / "a.json", "b")
+        assert (other.exists(), mine.exists()) == (True, False)
+    finally:
+        monkeypatch.undo()
+        files._machine.cache_clear()
+
+
+def test_partial_files_of_another_container_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    digests = set()
+    for namespace in ("pid:[1]", "pid:[2]"):
+        monkeypatch.setattr(files.os, "readlink", lambda path, namespace=namespace: namespace)
+        files._machine.cache_clear()
+        digests.add(files._machine())
+    files._machine.cache_clear()
+    assert len(digests) == 2
+
+
+@pytest.mark.parametrize("process", ["9" * 30, "\u00b2", "x", ""])
+def test_a_partial_file_with_an_odd_process_number_is_kept(process: str, tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "a.json") as partial:
+        partial.touch()
+        odd = partial.with_name(partial.name.replace(f"-{os.getpid()}-", f"-{process}-"))
+        odd.touch()
+    write_atomic(tmp_path / "a.json", "b")
+    assert odd.exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["x" * 255, "\u00e9" * 127, "x" + "\u4e2d" * 84], ids=["x", "two_bytes", "three_bytes"]
+)
+def test_the_longest_name_of_a_file_can_be_written(name: str, tmp_path: Path) -> None:
+    write_atomic(tmp_path / name, "a")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_name_that_is_too_long_is_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(WriteError, match=r"File name too long\. Choose a shorter name"):
+        write_atomic(tmp_path / ("x" * 256), "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", ["[]", '"x"', "5", "null", "[" * 100_000, '{"a": 1, "a": 1}', "", "\xff"])
+def test_a_damaged_list_of_a_suite_is_refused_in_one_line(content: str, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    from test_suites import _tiny
+
+    from tagjax.recording import RecordingError
+    from tagjax.sim import suites
+
+    (tmp_path / "tiny").mkdir()
+    (tmp_path / "tiny" / "suite.json").write_bytes(content.encode("latin-1"))
+    with pytest.raises(RecordingError, match=r"tiny has no readable suite\.json; expected") as refusal:
+        suites.prepare(_tiny(), tmp_path)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("link", ["cache", "cache/flow"])
+def test_flow_is_not_stored_where_a_link_leads_out_of_the_recording(link: str, scene: str, tmp_path: Path) -> None:
+    from tagjax.recording.store import open_recording
+
+    shutil.copytree(scene, tmp_path / "scene.zarr", ignore=shutil.ignore_patterns("cache"))
+    elsewhere = tmp_path / "elsewhere"
+    for folder in ("", "flow"):  # partial caches as old as those that are removed
+        (elsewhere / folder / ".old.partial").mkdir(parents=True)
+        os.utime(elsewhere / folder / ".old.partial", (0, 0))
+    before = sorted(elsewhere.rglob("*"))
+    (tmp_path / "scene.zarr" / link).parent.mkdir(exist_ok=True)
+    (tmp_path / "scene.zarr" / link).symlink_to(elsewhere)
+    found = cache.pair_flow(open_recording(tmp_path / "scene.zarr"), 2, 5, "dis_ultrafast")
+    assert sorted(elsewhere.rglob("*")) == before
+    stored = cache.pair_flow(open_recording(scene), 2, 5, "dis_ultrafast")
+    for one, other in zip(found, stored, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)  # float16 on the disk
+
+
+def test_flow_is_stored_in_a_recording_that_a_link_leads_to(scene: str, tmp_path: Path) -> None:
+    from tagjax.recording.store import open_recording
+
+    shutil.copytree(scene, tmp_path / "scene.zarr", ignore=shutil.ignore_patterns("cache"))
+    (tmp_path / "link.zarr").symlink_to(tmp_path / "scene.zarr")
+    cache.pair_flow(open_recording(tmp_path / "link.zarr"), 2, 5, "dis_ultrafast")
+    assert list((tmp_path / "scene.zarr" / "cache" / "flow").iterdir())
+
+
+def test_an_error_of_a_sweep_s_job_that_the_user_can_correct_is_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "experiments.evaluate", "-m", f"run={tmp_path / 'none'}"]
+    process = _start([*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"])
+    output, error = process.communicate(timeout=100)
+    assert process.returncode == 1
+    assert "Traceback" not in output + error
+    assert error.strip().splitlines()[-1].startswith("evaluate: ")
+    assert len(error.strip().splitlines()) == 2  # Hydra's line before it names the job's settings
+
+
+@pytest.mark.parametrize("value", [None, "", "0", "1"])
+def test_programs_that_a_command_starts_inherit_the_user_s_environment(value: str | None) -> None:
+    script = """
+        import os
+        from experiments.errors import ending_in_one_line, errors_in_one_line
+        with ending_in_one_line("x"):
+            with errors_in_one_line("x"):
+                print(os.environ.get("HYDRA_FULL_ERROR"))
+            print(os.environ.get("HYDRA_FULL_ERROR"))
+        print(os.environ.get("HYDRA_FULL_ERROR"))
+    """
+    process = _start(
+        [sys.executable, "-c", textwrap.dedent(script)], **({} if value is None else {"HYDRA_FULL_ERROR": value})
+    )
+    assert process.communicate(timeout=60)[0].splitlines() == [str(value), "1", str(value)]
+
+
+def test_training_in_a_shell_s_background_does_not_end_with_ctrl_c() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with loop._stop_on_signals() as received:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert received() == 0
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert received() == signal.SIGTERM
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_folder_without_locks_gives_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(*_: Any, **__: Any) -> None:
+        raise NotImplementedError("FileSystem does not appear to support flock")
+
+    monkeypatch.setattr("filelock.FileLock.acquire", no_locks)
+    with pytest.warns(RuntimeWarning, match="run: its file system has no locks"), locked_folder(tmp_path / "run"):
+        (tmp_path / "run" / "a").touch()
+    assert [path.name for path in (tmp_path / "run").iterdir() if path.name != ".lock"] == ["a"]

@@ -28,9 +28,10 @@ def build(settings: Mapping[str, Any], slot: Slot, *, where: str = "_target_", i
     try:
         return called(**parts)
     except TypeError as error:
-        raise ConfigError(f"{where}: {settings['_target_']} does not take these settings: {error}.") from error
-    except (ValueError, OverflowError) as error:
-        raise ConfigError(f"{where}: {error}") from error
+        text = " ".join(str(error).split())
+        raise ConfigError(f"{where}: {settings['_target_']} does not take these settings: {text}.") from error
+    except (ArithmeticError, AttributeError, LookupError, ValueError) as error:
+        raise ConfigError(f"{where}: {' '.join(str(error).split())}") from error
 
 
 def find_target(settings: Mapping[str, Any], slot: Slot, *, where: str) -> Callable[..., Any]:

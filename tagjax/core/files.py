@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import hashlib
 import os
 import re
 import shutil
@@ -14,6 +16,9 @@ from pathlib import Path
 
 _FREE_SPACE = "Free some space and start the command again: what was complete before is kept"
 _OTHER_FOLDER = "Choose a folder that can be written to, or change its permissions"
+_MAX_STEM_BYTES = 200
+"""Of a file's name, within the name of its partial file: most file systems allow 255 bytes in all."""
+
 _ADVICE = {
     errno.ENOSPC: _FREE_SPACE,
     errno.EDQUOT: _FREE_SPACE,
@@ -22,6 +27,7 @@ _ADVICE = {
     errno.EROFS: _OTHER_FOLDER,
     errno.EACCES: _OTHER_FOLDER,
     errno.EPERM: _OTHER_FOLDER,
+    errno.ENAMETOOLONG: "Choose a shorter name or a folder with a shorter path",
     errno.ENOTDIR: "A part of this path is a file: choose another folder",
 }
 
@@ -79,15 +85,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """A new path beside `path`, at which the block writes a file or a folder; it is renamed to `path` at the end.
 
     An existing file at `path` is replaced; an existing folder that is not empty raises `OSError`. If the block raises,
-    whatever it wrote is removed and `path` stays as it was. A killed process leaves `.<name>.<host>-<pid>-<random>.partial`
-    behind, which no reader opens; the next process on that host that writes the same path removes it. Parent folders are
-    created. Raises `WriteError` where the file system refuses to write.
+    whatever it wrote is removed and `path` stays as it was. A killed process leaves
+    `.<name>.<machine>-<pid>-<random>.partial` behind, which no reader opens; the next process on that machine that writes the
+    same path removes it, unless the machine was started again meanwhile. Parent folders are created. Raises `WriteError` where the file system refuses to write.
     """
     path = Path(path)
     with writing(path):
         make_folder(path.parent)
         _remove_abandoned(path)
-        partial = path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.partial")
+        partial = path.with_name(f"{_partial_start(path)}{os.getpid()}-{uuid.uuid4().hex[:8]}.partial")
         try:
             yield partial
             os.replace(partial, path)
@@ -117,18 +123,31 @@ def remove(path: Path) -> None:
 
 def _remove_abandoned(path: Path) -> None:
     """Remove what killed processes of this machine left of `path`."""
-    start = f".{path.name}.{_host()}-"
+    start = _partial_start(path)
     with os.scandir(path.parent) as entries:
         names = [entry.name for entry in entries if entry.name.startswith(start) and entry.name.endswith(".partial")]
     for name in names:
         process = name.removeprefix(start).split("-")[0]
-        if process.isdigit() and not _runs(int(process)):
+        if process.isascii() and process.isdigit() and not _runs(int(process)):
             remove(path.with_name(name))
 
 
-def _host() -> str:
-    """The machine's name, cut so that names of files stay within the limit of a file system."""
-    return socket.gethostname()[:16]
+def _partial_start(path: Path) -> str:
+    """How the names of a path's partial files begin that processes of this machine write."""
+    stem = os.fsencode(path.name)
+    name = path.name if len(stem) <= _MAX_STEM_BYTES else stem[:_MAX_STEM_BYTES].decode(errors="ignore")
+    return f".{name}.{_machine()}-"
+
+
+@functools.cache
+def _machine() -> str:
+    """A digest of what process numbers refer to: the machine's name, its current boot, the container's numbering."""
+    parts = [socket.gethostname()]
+    with contextlib.suppress(OSError):
+        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
+    with contextlib.suppress(OSError):
+        parts.append(os.readlink("/proc/self/ns/pid"))
+    return hashlib.sha256("\n".join(parts).encode("utf-8", "surrogatepass")).hexdigest()[:12]
 
 
 def _runs(process: int) -> bool:
@@ -139,6 +158,6 @@ def _runs(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:
+    except (OSError, OverflowError):
         return True
     return True

@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import socket
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,7 +29,8 @@ class FolderLockedError(ValueError):
 def locked_folder(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder, which is created if it is missing.
 
-    Raises `FolderLockedError` at once, with the number and the machine of the process, if another one holds it.
+    Raises `FolderLockedError` at once, with the number and the machine of the process, if another one holds it. Where the
+    file system has no locks, there is a `RuntimeWarning` and no lock.
     """
     make_folder(folder)
     lock = filelock.FileLock(folder / _LOCK)
@@ -39,6 +41,14 @@ def locked_folder(folder: Path) -> Iterator[None]:
         raise FolderLockedError(
             f"{folder} is in use: {_holder(folder)} writes to it. Wait for its end or stop it, or choose another folder."
         ) from None
+    except NotImplementedError:
+        warnings.warn(
+            f"{folder}: its file system has no locks. Start no second command that writes to this folder.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        yield
+        return
     try:
         write_atomic(folder / _HOLDER, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n")
         yield

@@ -89,14 +89,24 @@ def raise_on_signals() -> Iterator[None]:
         else:
             hook(ignored)
 
-    before, hook = _set_handlers(interrupt), sys.unraisablehook
+    hook = sys.unraisablehook
     sys.unraisablehook = raise_again
+    try:
+        with signals_handled(interrupt):
+            yield
+    finally:
+        sys.unraisablehook = hook
+
+
+@contextlib.contextmanager
+def signals_handled(handler: Any) -> Iterator[None]:
+    """Within the block `handler` is called at Ctrl-C and SIGTERM, unless they are ignored; nothing changes in other threads."""
+    before = _set_handlers(handler)
     try:
         yield
     finally:
-        sys.unraisablehook = hook
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 def _set_handlers(handler: Any) -> dict[int, Any]:
@@ -107,5 +117,5 @@ def _set_handlers(handler: Any) -> dict[int, Any]:
     changed = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
     for number in changed:
         signal.signal(number, handler)
-    # None: the handler was not set by Python and cannot be restored.
+    # None: the handler was not set by Python (but by JAX's distributed runtime) and cannot be restored.
     return {number: signal.SIG_DFL if old is None else old for number, old in changed.items()}

@@ -10,7 +10,11 @@ MAX_NAME = 100
 
 _NAME = re.compile(r"\w[\w .,()+@#:-]*")
 _NOT_IN_FILES = re.compile(r"[^\w.+-]+")
-_MAX_FILE_NAME = 80
+_LIKE_DIGEST = re.compile(r"-[0-9a-f]{8}$")
+_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)
+"""Names that stand for devices on Windows, with any extension."""
+
+_MAX_FILE_NAME_BYTES = 80
 
 
 def name_fault(name: object) -> str | None:
@@ -28,13 +32,17 @@ def name_fault(name: object) -> str | None:
 
 
 def safe_file_name(text: str) -> str:
-    """A file name that stays in its folder, on every system: `text` itself if it is one already.
+    """A file name of at most 90 bytes that stays in its folder, on every system: `text` itself if it is one already.
 
-    Other characters become `_`. A short digest of the text follows wherever something was changed, so that two texts
-    never share a file name.
+    Other characters become `_`. A digest of the text, of 32 bits, follows wherever something was changed and after a text
+    that ends like a digest, so that two texts get two names. Only file systems that ignore case or forms of Unicode take
+    two such names for one.
     """
-    safe = _NOT_IN_FILES.sub("_", text).strip("._ ")[:_MAX_FILE_NAME]
-    if safe == text and safe:
+    safe = _NOT_IN_FILES.sub("_", text).lstrip("._+-").rstrip("._")
+    safe = safe.encode()[:_MAX_FILE_NAME_BYTES].decode(errors="ignore")
+    if _RESERVED.fullmatch(safe):
+        safe = f"_{safe}"
+    if safe == text and safe and not _LIKE_DIGEST.search(safe):
         return safe
     return f"{safe or 'name'}-{hashlib.sha256(text.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
 

@@ -129,14 +129,22 @@ def _with_first_frame(
 
 
 def _folder(recording: Recording, key: str) -> Path | None:
-    """The folder of a recording's stored flow; None for a recording that has no folder or other images than its folder."""
+    """The folder of a recording's stored flow; None for a recording that has no folder or other images than its folder.
+
+    None also where a link leads out of the recording's folder: a recording from elsewhere could otherwise write anywhere.
+    """
     root, colour = recording.store, recording.colour
     if not isinstance(root, zarr.Group) or not isinstance(root.store, LocalStore):
         return None
     # Images that were replaced after opening have another flow than those of the folder.
     if not isinstance(colour, StoredFrames) or colour.array.store_path != root.store_path / "colour":
         return None
-    return Path(root.store.root) / root.path / _FOLDER / key
+    home = Path(root.store.root) / root.path
+    folder = home / _FOLDER / key
+    try:
+        return folder if folder.resolve().is_relative_to(home.resolve()) else None
+    except (OSError, RuntimeError):  # links in a circle
+        return None
 
 
 def _attributes(recording: Recording, key: str) -> dict[str, Any]:

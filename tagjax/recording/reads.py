@@ -118,10 +118,12 @@ class TagReads:
                 f"Tag reads: phase_sign is {self.phase_sign!r}; expected 1 (phase grows with distance) or -1."
             )
         period = self.phase_period_rad
-        if not isinstance(period, int | float) or not 0.1 <= period <= 2 * np.pi + 1e-6:
+        if isinstance(period, bool) or not isinstance(period, int | float) or not 0.1 <= period <= 2 * np.pi + 1e-6:
             raise RecordingError(
                 f"Tag reads: phase_period_rad is {period!r}; expected radians, 2 pi, or pi for a reader with flips."
             )
+        if self.pi_flips is not None and not isinstance(self.pi_flips, bool | np.bool_):
+            raise RecordingError(f"Tag reads: pi_flips is {self.pi_flips!r}; expected true, false, or null if unknown.")
         if not all(isinstance(carrier, int | float) and 300e6 <= carrier <= 6e9 for carrier in self.hop_table_hz):
             raise RecordingError(f"Tag reads: hop_table_hz is {self.hop_table_hz!r}; expected UHF carriers in Hz.")
         if num_reads == 0:

@@ -198,10 +198,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         return name in listed if listed is not None else name in root
 
     columns = {name: array(f"reads/{name}")[...] for name in _READ_COLUMNS if has(f"reads/{name}")}
-    columns["epc"] = (
-        np.asarray(attributes["epcs"], dtype=str)[columns["epc"]] if attributes["epcs"] else np.empty(0, str)
-    )
-    _check_unique(attributes["epcs"], "epcs", path)
+    columns["epc"] = _epcs(attributes["epcs"], columns["epc"], path)
     stored = dict(attributes["reads"])
     stored["hop_table_hz"] = tuple(stored["hop_table_hz"])
     reads = TagReads(**columns, **stored)
@@ -220,6 +217,9 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
             tag_to_label=attributes["truth"]["tag_to_label"],
             **tables,  # type: ignore[arg-type]
         )
+    for text in ("name", "source"):
+        if not isinstance(attributes[text], str):
+            raise RecordingError(f"{path}: {text} is {attributes[text]!r}; expected a text. Copy or import it again.")
     intrinsics = dict(attributes["intrinsics"])
     intrinsics["distortion"] = tuple(intrinsics["distortion"])
     return Recording(
@@ -236,6 +236,21 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         source=attributes["source"],
         store=root if writable else None,
     )
+
+
+def _epcs(names: Any, index: np.ndarray, path: str) -> np.ndarray:
+    """The EPC of each read, str (num_reads,), from its index in the list of EPCs."""
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise RecordingError(f"{path}: epcs is {str(names)[:60]}; expected a list of texts. Copy or import it again.")
+    _check_unique(names, "epcs", path)
+    # A negative index would give another tag's name.
+    if index.dtype.kind not in "iu" or (index.size and not 0 <= index.min() <= index.max() < len(names)):
+        found = f"{index.min()} to {index.max()} ({index.dtype})" if index.size else str(index.dtype)
+        raise RecordingError(
+            f"{path}: reads/epc holds {found}; expected integers from 0 to {len(names) - 1}, the places in epcs. "
+            "Copy or import it again."
+        )
+    return np.asarray(names, dtype=str)[index] if names else np.empty(0, str)
 
 
 def _check_unique(names: Sequence[Any], what: str, path: str) -> None:

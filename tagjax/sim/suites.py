@@ -20,6 +20,7 @@ from filelock import FileLock
 
 from ..core.files import atomic_path, make_folder, write_atomic, writing
 from ..core.interruption import exit_status
+from ..core.json_text import parse_json
 from ..core.settings import ConfigError
 from ..core.worker_process import end_with_parent, signals_blocked, unblock_sigterm
 from ..recording import RecordingError
@@ -209,7 +210,9 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
     manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
     if home.exists() and not all(path.name.startswith(".") for path in home.iterdir()):
         try:
-            found = json.loads((home / MANIFEST).read_text())
+            found = parse_json((home / MANIFEST).read_bytes())
+            if not isinstance(found, dict):
+                raise ValueError(f"found {type(found).__name__}; expected an object")
         except (OSError, ValueError) as error:
             raise RecordingError(
                 f"{home} has no readable {MANIFEST}; expected a folder made for this suite, or none. Choose another "

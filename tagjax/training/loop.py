@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
@@ -12,6 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import jax
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from ..core.interruption import signals_handled
 from .checkpoint import CheckpointError, Checkpoints
 from .logging import Logger
 from .processes import is_first, local_batch_size, max_over_processes
@@ -76,9 +76,6 @@ def _stop_on_signals() -> Iterator[Callable[[], int]]:
     once.
     """
     received = 0
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: 0
-        return
 
     def handler(number: int, frame: Any) -> None:
         nonlocal received
@@ -86,13 +83,8 @@ def _stop_on_signals() -> Iterator[Callable[[], int]]:
             raise KeyboardInterrupt
         received = max(received, number)
 
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with signals_handled(handler):
         yield lambda: received
-    finally:
-        for number, earlier in before.items():
-            # None: the handler was not set by Python (but by JAX's distributed runtime) and cannot be restored.
-            signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
 
 
 def resume_state(state: StateT, samples: DataIterator, checkpoints: Checkpoints, *, allowed: bool) -> StateT:
