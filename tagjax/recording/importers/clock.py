@@ -12,12 +12,11 @@ import dataclasses
 import datetime as dt
 
 import numpy as np
-import scipy.ndimage
 import scipy.stats
 
 from ...core.errors import RecordingError
 from ..recording import ClockAudit, ClockPiece
-from .clock_jumps import continuous_pieces
+from .clock_jumps import continuous_pieces, far_too_small
 
 MAX_DRIFT_PPM = 1000.0
 """A larger drift is no quartz: the times have a wrong unit, or one of the clocks does not run."""
@@ -86,7 +85,7 @@ def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> HostTimes:
         fits.append(fit)
     usable &= ~repeats
     num_set_aside = int(np.sum(~usable))
-    if num_set_aside > max(1.0, MAX_SET_ASIDE * len(reader)):
+    if num_set_aside > max(2.0, MAX_SET_ASIDE * len(reader)):
         raise RecordingError(
             f"{num_set_aside} of {len(reader)} reader times differ from the times of arrival by more than delays explain, or are "
             f"too few to know the offset of the clocks to {1e3 * MAX_UNCERTAINTY_S:.0f} ms; expected at most {MAX_SET_ASIDE:.0%}. "
@@ -151,8 +150,9 @@ def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
     # Integers are subtracted before they become float64 seconds, which resolve 1.7e9 s to 0.2 us only.
     reference, base = _median(reader[in_order]), _median(arrival[in_order] - reader[in_order])
     since_s, delay_s = (reader - reference) * 1e-9, (arrival - reader - base) * 1e-9
-    # The first time of arrival may be wrong and yet the smallest. At an end the median counts the values inside twice.
-    in_order &= delay_s > scipy.ndimage.median_filter(delay_s, 7, mode="mirror") - _LATE_S
+    in_order &= ~far_too_small(delay_s)  # wrong, and yet in order: where reads are rare, or at an end
+    if in_order.sum() < 2:
+        raise RecordingError(_no_clock(reader, arrival, "its times do not increase"))
     line = _envelope_line(since_s[in_order], delay_s[in_order])
     span_s = float(np.ptp(since_s[in_order]))
     limit = MAX_DRIFT_PPM * 1e-6

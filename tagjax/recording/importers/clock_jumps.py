@@ -19,7 +19,9 @@ def continuous_pieces(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> list[np.
     """
     delay_ns = arrival_ns - reader_ns
     delay_s = (delay_ns - np.partition(delay_ns, len(delay_ns) // 2)[len(delay_ns) // 2]) * 1e-9
-    cuts, threshold_s = _jumps(_without_single(delay_s))
+    # A single wrong row is no jump: the median of its neighbours stands in for it.
+    usual_s = scipy.ndimage.median_filter(delay_s, 7, mode="mirror")
+    cuts, threshold_s = _jumps(np.where(far_too_small(delay_s), usual_s, delay_s))
     pieces = np.split(np.arange(len(delay_s)), cuts)
     levels = [_low(delay_s[rows]) for rows in pieces]
     window = _window(len(delay_s))
@@ -45,11 +47,13 @@ def continuous_pieces(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> list[np.
     return [np.concatenate([pieces[piece] for piece in sorted(group)]) for group in groups]
 
 
-def _without_single(delay_s: np.ndarray) -> np.ndarray:
-    """The delays, with the median of their neighbours in place of single ones that are far too small."""
-    usual_s = scipy.ndimage.median_filter(delay_s, 7, mode="mirror")
-    below_s = usual_s - delay_s
-    return np.where(below_s > 10 * np.median(np.abs(below_s)) + _MIN_JUMP_S, usual_s, delay_s)
+def far_too_small(delay_s: np.ndarray) -> np.ndarray:
+    """Rows whose delay is far below the median of their neighbours: latency makes delays larger, a wrong time smaller too.
+
+    At an end the median counts the rows inside twice, so that a wrong first row stands out.
+    """
+    below_s = scipy.ndimage.median_filter(delay_s, 7, mode="mirror") - delay_s
+    return below_s > 10 * np.median(np.abs(below_s)) + _MIN_JUMP_S
 
 
 def _without_queues(groups: list[list[int]], levels: list[float], threshold_s: float) -> list[list[int]]:
