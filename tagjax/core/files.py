@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import socket
+import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -87,7 +88,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     An existing file at `path` is replaced; an existing folder that is not empty raises `OSError`. If the block raises,
     whatever it wrote is removed and `path` stays as it was. A killed process leaves
     `.<name>.<machine>-<pid>-<random>.partial` behind, which no reader opens; the next process on that machine that writes the
-    same path removes it, unless the machine was started again meanwhile. Parent folders are created. Raises `WriteError` where the file system refuses to write.
+    same path removes it, unless the machine was started again meanwhile. Parent folders are created. Raises `WriteError`
+    where the file system refuses to write.
     """
     path = Path(path)
     with writing(path):
@@ -97,8 +99,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         try:
             yield partial
             os.replace(partial, path)
-        finally:
-            remove(partial)
+        except BaseException:
+            _remove_while_written(partial)
+            raise
 
 
 def write_atomic(path: str | Path, content: str | bytes) -> None:
@@ -119,6 +122,15 @@ def remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
+
+
+def _remove_while_written(path: Path) -> None:
+    """Remove a folder to which threads, such as Zarr's, may still be writing: they would make it anew."""
+    for _ in range(5):
+        remove(path)
+        time.sleep(0.05)
+        if not path.exists():
+            return
 
 
 def _remove_abandoned(path: Path) -> None:

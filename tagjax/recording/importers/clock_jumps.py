@@ -53,7 +53,7 @@ def far_too_small(delay_s: np.ndarray) -> np.ndarray:
     At an end the median counts the rows inside twice, so that a wrong first row stands out.
     """
     below_s = scipy.ndimage.median_filter(delay_s, 7, mode="mirror") - delay_s
-    return below_s > 10 * np.median(np.abs(below_s)) + _MIN_JUMP_S
+    return below_s > 3 * np.quantile(np.abs(below_s), 0.95) + _MIN_JUMP_S
 
 
 def _without_queues(groups: list[list[int]], levels: list[float], threshold_s: float) -> list[list[int]]:
