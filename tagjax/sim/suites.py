@@ -10,7 +10,7 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ MANIFEST = "suite.json"
 
 _VERSION = 2
 _DRAWS = 6
+_MAX_END_S = 10.0  # a worker removes what it was writing within this time, or is killed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -286,10 +287,20 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
         except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
             if isinstance(error, KeyboardInterrupt):  # after another error, the recordings in progress are finished
-                for worker in set(multiprocessing.active_children()) - others:
-                    worker.terminate()
+                _end(set(multiprocessing.active_children()) - others)
             raise
     return made
+
+
+def _end(workers: Collection[multiprocessing.process.BaseProcess]) -> None:
+    """End workers and wait for it: none may still write when the unfinished recordings are removed."""
+    for worker in workers:
+        worker.terminate()
+    for worker in workers:
+        worker.join(_MAX_END_S)
+        if worker.is_alive():
+            worker.kill()
+            worker.join()
 
 
 def _make_in_worker(item: Item, folder: Path) -> Made:
