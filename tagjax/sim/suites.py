@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import multiprocessing
+import multiprocessing.process
 import os
 import shutil
 import signal
