@@ -35,6 +35,15 @@ def test_a_test_that_was_skipped_in_every_run_is_named(tmp_path: Path) -> None:
     assert found.stdout.splitlines() == ["never run: tests.test_a::test_three: x"]
 
 
+def test_an_expected_failure_was_run(tmp_path: Path) -> None:
+    (tmp_path / "test_it.py").write_text("import pytest\n\ndef test_stale():\n    pytest.xfail('stale')\n")
+    report = tmp_path / "a.xml"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={report}", "test_it.py"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
+    found = _check(report)
+    assert found.returncode == 0, found.stdout
+
+
 def test_tests_of_real_recordings_may_be_skipped(tmp_path: Path) -> None:
     report = _report(tmp_path / "a.xml", ("test_one", None), ("test_two", "no real recordings at somewhere"))
     assert _check(report).returncode == 0

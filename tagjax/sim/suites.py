@@ -7,9 +7,7 @@ import itertools
 import json
 import multiprocessing
 import multiprocessing.process
-import os
 import shutil
-import signal
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -20,7 +18,6 @@ import numpy as np
 from filelock import FileLock
 
 from ..core.files import atomic_path, make_folder, write_atomic, writing
-from ..core.interruption import exit_status
 from ..core.json_text import parse_json
 from ..core.settings import ConfigError
 from ..core.worker_process import end_with_parent, signals_blocked, unblock_sigterm
@@ -40,7 +37,6 @@ MANIFEST = "suite.json"
 
 _VERSION = 2
 _DRAWS = 6
-_MAX_END_S = 10.0  # a worker removes what it was writing within this time, or is killed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,7 +276,7 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
     with ProcessPoolExecutor(min(workers, len(items)), mp_context=context, initializer=_begin_worker) as pool:
         try:
             with signals_blocked():
-                waiting = {pool.submit(_make_in_worker, item, folder) for item in items}
+                waiting = {pool.submit(make_item, item, folder) for item in items}
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -296,32 +292,15 @@ def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Call
 def _end(workers: Collection[multiprocessing.process.BaseProcess]) -> None:
     """End workers and wait for it: none may still write when the unfinished recordings are removed."""
     for worker in workers:
-        worker.terminate()
+        worker.kill()
     for worker in workers:
-        worker.join(_MAX_END_S)
-        if worker.is_alive():
-            worker.kill()
-            worker.join()
-
-
-def _make_in_worker(item: Item, folder: Path) -> Made:
-    """`make_item` in a worker, which ends after SIGTERM; the pool itself would give it the next item."""
-    try:
-        return make_item(item, folder)
-    except SystemExit:
-        os._exit(exit_status(signal.SIGTERM))
+        worker.join()
 
 
 def _begin_worker() -> None:
-    """SIGTERM ends a worker without a traceback, and what it has written of a recording is removed."""
-
-    def end(number: int, frame: Any) -> None:
-        raise SystemExit(exit_status(number))
-
+    """SIGTERM ends a worker at once and without a traceback: what it has written, the process that started it removes."""
     end_with_parent()
-    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(exit_status(number)))
-    unblock_sigterm()  # one that came during the imports ends the worker here
-    signal.signal(signal.SIGTERM, end)
+    unblock_sigterm()
 
 
 def make_items(
