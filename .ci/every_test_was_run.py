@@ -11,6 +11,9 @@ from pathlib import Path
 
 MAY_BE_SKIPPED = "no real recordings at "
 
+_EXPECTED_FAILURE = "pytest.xfail"
+"""The type of what a report calls skipped, although the test was run and failed as expected."""
+
 
 def never_run(reports: list[Path]) -> dict[str, str]:
     """The tests that no report has run, each with the reason that was given last."""
@@ -20,9 +23,7 @@ def never_run(reports: list[Path]) -> dict[str, str]:
         for case in ElementTree.parse(report).getroot().iter("testcase"):
             name = f"{case.get('classname')}::{case.get('name')}"
             reason = case.find("skipped")
-            if (
-                reason is None or reason.get("type") == "pytest.xfail"
-            ):  # the report calls a failure that was expected skipped
+            if reason is None or reason.get("type") == _EXPECTED_FAILURE:
                 run.add(name)
             else:
                 skipped[name] = reason.get("message", "")

@@ -43,6 +43,6 @@ def signals_blocked() -> Iterator[None]:
 
 
 def unblock_sigterm() -> None:
-    """In a worker, after it has set its handler: SIGTERM is delivered from now on, also one that came before."""
+    """In a worker, after it has set its handler if it has one: SIGTERM is delivered from now on, also one that came before."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
