@@ -152,10 +152,10 @@ def test_false_alarms_are_detections_of_stationary_tags_labelled_or_not(monkeypa
     monkeypatch.setattr(Systems, "stride", lambda *_: 1)
     systems, tally = Systems(config.systems, config.scores), _Tally()
     item = Item(from_mapping(Suite, config.suites["occlusion"]), Variant("all"), "test", 0, 1)
-    scores = dataclasses.replace(config.scores, moved_for_s=0.0, min_pixels=2)
+    scores = dataclasses.replace(config.scores, min_pixels=2)
     _score(systems, "tagview", item, recording, scores, tally)
     assert np.mean(np.concatenate(tally.false_alarms)) == pytest.approx(3 / num)
-    assert tally.scores.result()["false_detections"] == pytest.approx((3 + num) / (2 * num))
+    assert tally.scores.result()["p_fa"] == pytest.approx((3 + num) / (2 * num))
 
 
 def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -202,7 +202,7 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     config = _config(
         ["planar_tracks"], smoke=True, max_recordings=1, recordings_dir=str(tmp_path / "made"), only=("tagattention_paper", "tagvision", "goller")
     )  # fmt: skip
-    config = dataclasses.replace(config, scores=dataclasses.replace(config.scores, moved_for_s=0.2, min_pixels=2))
+    config = dataclasses.replace(config, scores=dataclasses.replace(config.scores, min_pixels=2))
     reported: list[str] = []
     cells = run_comparison(config, tmp_path / "out", on_progress=reported.append)
     paper, vision, goller = cells

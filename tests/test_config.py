@@ -73,7 +73,7 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"scores": {"tags_at_once": 0}}, r"scores: tags_at_once is 0; expected at least 1"),
         ({"scores": {"frames_at_once": -1}}, r"scores: frames_at_once is -1; expected at least 1"),
         ({"scores": {"mask_level": 50.0}}, r"scores: mask_level is 50\.0; expected a value from 0 to 1"),
-        ({"scores": {"frames": [9, 3]}}, r"scores: frames is \[9, 3\]; expected \[from, to\]"),
+        ({"scores": {"from_s": 2.0, "until_s": 1.0}}, r"scores: until_s is 1\.0; expected more than from_s, 2\.0"),
     ],
 )
 def test_wrong_configuration_names_the_key(given: dict, message: str) -> None:

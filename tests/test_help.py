@@ -62,7 +62,7 @@ def test_every_choice_that_is_listed_can_be_chosen(name: str) -> None:
 
 def test_comments_come_from_the_files_of_the_groups() -> None:
     text = _help("train", "experiment=handheld", "joint=pyramid")
-    assert re.search(r"^  lock_frames: 10  # frames in a row", text, re.MULTILINE)
+    assert re.search(r"^  lock_s: 0\.33  # the time for which", text, re.MULTILINE)
     assert re.search(r"^  flow@joint\.flow=pyramid  \(flownet_c, .*, raft_small\)$", text, re.MULTILINE)
     assert re.search(r"^    min_motion: 0\.1  # a clip is drawn if", text, re.MULTILINE)
     assert "flow@joint.flow" not in _help("train")

@@ -61,7 +61,7 @@ def _values(recordings: list[str]) -> dict:
         "objective": {"span_frames": 5, "skip_frames": 3, "max_reads": 64, "num_channels": 4, "future_stride": 1},
         "loop": {"num_steps": 2, "batch_size": 1, "checkpoint_every": 1, "validate_every": 2, "progress": False},
         "logger": {"mode": "disabled"},
-        "scores": {"num_pictures": 2, "moved_for_s": 0.5},
+        "scores": {"num_pictures": 2, "from_s": 0.5},
     }
 
 
@@ -93,7 +93,7 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
             "frames": [0, 9],
             "baselines": {},
             "clips": {"stride": 8},
-            "scores": {"moved_for_s": 0.0},
+            "scores": {"from_s": 0.0},
             "progress": False,
         },
     )

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
+from frame_scores import frame_scores
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from experiments.suites import suites_named
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.reproduce import measure as measuring
-from tagjax.evaluation.reproduce.interval import ratio_estimate
 from tagjax.evaluation.reproduce.make import make_table
 from tagjax.evaluation.reproduce.markdown import differing, not_made, rendered, replaced, write_pages
 from tagjax.evaluation.reproduce.measure import Inputs, Tracing, measure
@@ -29,8 +29,9 @@ from tagjax.evaluation.reproduce.recipe import COUNTS, MEASURES, Job, Recipe
 from tagjax.evaluation.reproduce.scores import RecordingScores
 from tagjax.evaluation.reproduce.status import stale, status
 from tagjax.evaluation.reproduce.table import begin, filled, read_table, table_path, write_table
+from tagjax.metrics.interval import ratio_estimate
 from tagjax.metrics.recordings import RecordingResult, ScoreSettings
-from tagjax.metrics.tracking import FrameScores, Scores
+from tagjax.metrics.tags import Scores
 from tagjax.sim.suites import Suite
 
 ROOT = Path(__file__).parents[1]
@@ -81,7 +82,7 @@ RECIPE: dict[str, Any] = {
             "recorded": {"iou": {"text": "0.7", "command": "evaluate it", "revision": "ab" * 20, "date": "2026-01-02"}},
         },
     ],
-    "protocols": {"part": {"frames": [0, 30], "scores": {"moved_for_s": 0.0}}},
+    "protocols": {"part": {"frames": [0, 30], "scores": {"from_s": 0.0}}},
     "systems": {"online": {"tracer": "tagattention_paper", "clips": {"stride": 2}}},
     "depends": ["code/*.py", "recipe.yaml"],
 }
@@ -316,7 +317,7 @@ def test_a_recipe_that_cannot_be_made_is_refused(changed: dict[str, Any], messag
 
 
 def test_every_measure_is_one_that_scores_have():
-    scores = _result().scores().merge(Scores.of_unlabelled(np.ones(3, bool)))
+    scores = _result().scores().merge(Scores.of_false_detections(np.ones(3, bool)))
     assert set(MEASURES) - set(COUNTS) - {"locked"} <= set(scores.means)
 
 
@@ -342,21 +343,16 @@ def test_a_recorded_value_has_one_whole_source(source: dict[str, str]):
 
 
 def _result() -> RecordingResult:
-    """One recording's scores, of two tags over three frames."""
-    truth = synthetic.recording(num_frames=3)
-    frames = FrameScores(
-        time_s=np.arange(3) / 10,
-        iou=np.array([0.2, 0.6, 0.7]),
-        cle_px=np.array([5.0, np.nan, 3.0]),
-        mask_j=np.full(3, 0.5),
-        identified=np.array([1, 1, 2]),
-        confidence=np.ones(3),
-        detected=np.array([True, True, True]),
-        visible=np.ones(3, bool),
-        has_moved=np.array([False, True, True]),
-        label=1,
+    """One recording's scores, of two tags over four frames."""
+    truth = synthetic.recording(num_frames=4)
+    frames = frame_scores(
+        [0.2, 0.6, 0.7, 0.8],
+        cle_px=[5.0, np.nan, 3.0, 3.0],
+        mask_j=np.full(4, 0.5),
+        identified=[1, 1, 2, 1],
+        since_motion=[-1, 0, 1, 2],
     )
-    return RecordingResult(truth, {"tag-a": frames, "tag-b": frames}, [], ScoreSettings(lock_frames=2))
+    return RecordingResult(truth, {"tag-a": frames, "tag-b": frames}, [], ScoreSettings(lock_s=0.2))
 
 
 @pytest.fixture
@@ -389,10 +385,10 @@ def test_scores_are_kept_as_sums(tmp_path: Path, traced: list[Path]):
     assert list(scores) == [Job("small", "test", None, "part", "online")]
     (found,) = scores.values()
     assert len(found) == len(traced) == 4
-    assert (found[0].num_tags, found[0].num_frames) == (2, 4)
-    assert found[0].sums["iou"] == pytest.approx((2.6, 4))
-    assert found[0].sums["cle_px"] == pytest.approx((6.0, 2))
-    assert found[0].sums["identification"] == pytest.approx((2.0, 4))
+    assert (found[0].num_tags, found[0].num_frames) == (2, 6)
+    assert found[0].sums["iou"] == pytest.approx((4.2, 6))
+    assert found[0].sums["cle_px"] == pytest.approx((12.0, 4))
+    assert found[0].sums["identification"] == pytest.approx((4.0, 6))
     assert found[0].sums["locked"] == (2.0, 2)
 
 
@@ -426,7 +422,7 @@ def test_an_interrupted_measurement_loses_one_recording_at_most(
         ({}, {"code": {"code/one.py": "3" * 40}}, 4),
         ({}, {"code": {"code/one.py": "1" * 40, "recipe.yaml": "3" * 40}}, 0),
         ({"title": "Another title"}, {}, 0),
-        ({"protocols": {"part": {"frames": [0, 31], "scores": {"moved_for_s": 0.0}}}}, {}, 4),
+        ({"protocols": {"part": {"frames": [0, 31], "scores": {"from_s": 0.0}}}}, {}, 4),
         ({"systems": {"online": {"tracer": "tagattention_paper", "clips": {"stride": 4}}}}, {}, 4),
         ({}, {"suites": {"small": {**SUITE, "seed": 8}}}, 4),
         ({}, {"suites": {"small": {**SUITE, "about": "in other words"}}}, 0),
@@ -485,7 +481,7 @@ def test_a_table_is_made_with_all_that_its_values_can_be_computed_from(root: Pat
     assert table == json.loads(json.dumps(made))
     assert table is not None
     cell = table["rows"][0]["cells"]["iou"]
-    assert (cell["num_recordings"], cell["num_tags"], cell["num_frames"]) == (4, 8, 16)
+    assert (cell["num_recordings"], cell["num_tags"], cell["num_frames"]) == (4, 8, 24)
     sums = [one["sums"]["iou"] for one in table["recordings"][cell["job"]]]
     totals, counts = np.array([one[0] for one in sums]), np.array([one[1] for one in sums])
     assert dataclasses.asdict(ratio_estimate(totals, counts)) == cell["values"]["iou"]
@@ -509,7 +505,7 @@ def test_a_table_of_a_simulated_suite_is_made(root: Path):
         "variants": [{"name": "a", "settings": {"kinds": ["box"]}}],
         "settings": {"room": "meeting_room"},
     }
-    protocol = {"frames": [0, 16], "scores": {"moved_for_s": 0.0, "frames": [4, 16], "min_pixels": 1}}
+    protocol = {"frames": [0, 16], "scores": {"min_pixels": 1}}
     make: Callable[[], dict[str, Any]] = lambda: make_table(  # noqa: E731
         _recipe(protocols={"part": protocol}),
         root,
@@ -564,7 +560,7 @@ def test_tables_that_need_the_same_scores_share_them():
     )
     for suite in ("single_static", "multi_4"):
         for system in ("online", "offline", "paper"):
-            one = f"{suite}/test/handheld/"
+            one = f"{suite}/test/whole/"
             assert main[f"{one}handheld_{system}"] == handheld[f"{one}{system}"]
 
 

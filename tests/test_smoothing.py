@@ -212,7 +212,7 @@ def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
 
 def test_a_forward_only_tracer_is_refused_for_smoothing(tmp_path: Path) -> None:
     recording = open_recording(synthetic.stored(tmp_path, 8)[0])
-    settings = ScoreSettings(smooth=True, num_pictures=1, moved_for_s=0.2)
+    settings = ScoreSettings(smooth=True, num_pictures=1, from_s=0.2)
     with pytest.raises(RecordingError, match="TagAttentionPaper has no backward pass; expected TagAttention"):
         next(trace_recording(TagAttentionPaper(), recording, _load, epcs=EPCS, settings=settings))
     common = {

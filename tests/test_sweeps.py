@@ -115,7 +115,7 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
         *("data.clips.stride=4", "data.clips.length=8", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),
         *("loop.num_steps=1", "loop.checkpoint_every=1", "loop.validate_every=1", "loop.progress=false"),
         *("objective.span_frames=4", "objective.skip_frames=3", "objective.max_reads=64", "objective.num_channels=4"),
-        *("scores.num_pictures=1", "scores.moved_for_s=0.3", f"hydra.sweep.dir={tmp_path / 'sweep'}/${{now:%f}}"),
+        *("scores.num_pictures=1", "scores.from_s=0.3", f"hydra.sweep.dir={tmp_path / 'sweep'}/${{now:%f}}"),
         *(f"hydra.sweeper.storage=sqlite:///{storage}", "num_trials=4"),
     ]
     with subprocess.Popen(command, cwd=ROOT, env=_environment(), stdout=subprocess.DEVNULL) as process:

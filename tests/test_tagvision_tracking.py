@@ -170,7 +170,7 @@ def test_the_system_detects_and_identifies_tagged_objects(drawn: Recording, trac
 
 
 def test_its_traces_are_scored_by_the_same_code(drawn: Recording) -> None:
-    settings = evaluate.ScoreSettings(moved_for_s=1.0, num_pictures=1)
+    settings = evaluate.ScoreSettings(from_s=1.0, num_pictures=1)
     names = drawn.resolve_epcs(None)
     traces = host_trace(TagVisionTracer(scenes.OVER, SYSTEM), drawn, epcs=names)
     result = evaluate.score_traces(traces, drawn, names, settings=settings)

@@ -90,7 +90,7 @@ def test_a_recording_is_trained_on_evaluated_and_traced_without_mujoco_and_matpl
         "objective": {"span_frames": 5, "skip_frames": 3, "max_reads": 64, "num_channels": 4, "future_stride": 1},
         "loop": {"num_steps": 2, "checkpoint_every": 1, "validate_every": 2, "progress": False},
         "logger": {"mode": "disabled"},
-        "scores": {"num_pictures": 2, "moved_for_s": 0.5},
+        "scores": {"num_pictures": 2, "from_s": 0.5},
     }
     evaluation = {"run": str(tmp_path / "run"), "progress": False}
     _run(

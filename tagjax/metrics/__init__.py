@@ -1,1 +1,1 @@
-"""Scores of boxes, masks, identities and optical flow."""
+"""Scores of boxes, masks, identities, tracks and optical flow."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from ..flow.images import to_float
-from .tracking import MaskedMean
+from .mean import MaskedMean
 
 OUTLIERS_PX = (1, 3, 5)
 """Thresholds of the end-point error, pixels, above which the fraction of pixels is counted."""

@@ -3,47 +3,48 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from ..recording import Recording, RecordingError
+from ..recording import Recording, Truth
 from ..tracing.recordings import TraceSettings, trace_recording
 from ..tracing.tracer import AbstractSmoother, AbstractTracer, Trace
-from . import tracking
-from .tracking import FrameScores, Scores
+from .boxes import box_iou, centre_error, label_box, labelled_area, touches_border
+from .locking import first_motion
+from .masks import BOUNDARY_PX, best_covered_label, boundary_f, boundary_tolerances_px, mask_iou
+from .multi_object import MatchFrame, MultiObjectScores
+from .tags import FrameScores, Scores
 
 
 @dataclasses.dataclass(frozen=True)
 class ScoreSettings(TraceSettings):
     """Which frames are scored, and how."""
 
-    moved_for_s: float = 1.5  # frames of a tag are scored once it has moved for this long in total
-    min_speed_m_s: float = 0.1  # lower speeds do not count as motion
-    frames: tuple[int, int] | None = None  # only frames from <= number < to are scored; all are traced
-    moved_restarts: bool = False  # True: after an unknown position the time of motion starts anew
+    min_speed_m_s: float = 0.1  # frames of a tag count from the first time that it is as fast as this
+    from_s: float = 0.0  # only frames from this long after that time
+    until_s: float | None = None  # to this long after it; to the end if None
     border_px: float = 2.0  # objects within this margin of the labelled area's edge are not scored: they may be cut off
     threshold: float = 0.5  # box IoU of a lock and of a success
-    lock_frames: int = 5
+    lock_s: float = 0.33  # the time for which a lock has to last
     min_pixels: int = 100  # objects with fewer visible pixels are not scored
     mask_level: float = 0.5  # threshold of soft masks
     num_pictures: int = 12  # overlay pictures a recording, evenly spread
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        minimum = {"lock_frames": 1, "num_pictures": 0, "min_pixels": 0}
-        minimum |= {"moved_for_s": 0, "min_speed_m_s": 0, "border_px": 0}
+        minimum = dict.fromkeys(("num_pictures", "min_pixels", "from_s", "lock_s", "min_speed_m_s", "border_px"), 0)
         for name, lowest in minimum.items():
             if not getattr(self, name) >= lowest:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected at least {lowest}.")
         for name in ("threshold", "mask_level"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected a value from 0 to 1.")
-        if self.frames is not None and not 0 <= self.frames[0] < self.frames[1]:
-            raise ValueError(f"frames is {list(self.frames)}; expected [from, to] with 0 <= from < to.")
+        if self.until_s is not None and not self.until_s > self.from_s:
+            raise ValueError(f"until_s is {self.until_s}; expected more than from_s, {self.from_s}.")
 
     def supported_by(self, tracer: AbstractTracer) -> ScoreSettings:
         """These settings, with smoothing switched off for a tracer without a backward pass."""
@@ -74,22 +75,23 @@ class RecordingResult:
     pictures: list[Picture]
     settings: ScoreSettings
     unlabelled: dict[str, Bool[np.ndarray, " time"]] = dataclasses.field(default_factory=dict)
+    multi_object: MultiObjectScores = dataclasses.field(default_factory=MultiObjectScores)
 
     def tag_scores(self) -> dict[str, Scores]:
         """The scores of each tag by itself."""
         chosen = self.settings
         return {
-            epc: Scores.of(frames, threshold=chosen.threshold, lock_frames=chosen.lock_frames)
+            epc: Scores.of(frames, threshold=chosen.threshold, lock_s=chosen.lock_s)
             for epc, frames in self.frames.items()
         }
 
     def scores(self) -> Scores:
         """All tags together; every frame has the same weight."""
-        total = Scores()
+        total = Scores(multi_object=self.multi_object)
         for scores in self.tag_scores().values():
             total = total.merge(scores)
         for detected in self.unlabelled.values():
-            total = total.merge(Scores.of_unlabelled(detected))
+            total = total.merge(Scores.of_false_detections(detected))
         return total
 
 
@@ -152,108 +154,154 @@ def score_traces(
     settings = settings or ScoreSettings()
     first, last = frames or (0, recording.num_frames)
     height, width = recording.image_shape
-    truth = recording.truth
+    truth = recording.truth if recording.truth is not None and recording.truth.labels is not None else None
     scored = {epc: truth.tag_to_label[epc] for epc in names if truth is not None and epc in truth.tag_to_label}
-    if truth is None or truth.labels is None:
-        scored = {}
     kept = set(np.linspace(first, last - 1, settings.num_pictures).astype(int).tolist())
-    rows: dict[str, list[tuple[Any, ...]]] = {epc: [] for epc in scored}
-    detections: dict[str, list[bool]] = {epc: [] for epc in names if scored and epc not in scored}
+    rows: dict[str, list[dict[str, Any]]] = {epc: [] for epc in scored}
+    found_boxes: list[np.ndarray] = []
+    detected: list[np.ndarray] = []
     pictures: list[Picture] = []
     for number, trace in traces:
         boxes = box_to_picture(np.asarray(trace.box_px), stride, height, width)
+        found_boxes.append(boxes)
+        detected.append(np.asarray(trace.detected, bool))
         masks = {
             tag: mask_to_picture(np.asarray(trace.mask[tag]), stride, height, width) >= settings.mask_level
             for tag, epc in enumerate(names)
             if epc in scored or number in kept
         }
-        labels = np.asarray(truth.labels[number]) if truth is not None and truth.labels is not None else None
-        if labels is not None:
+        if truth is not None and truth.labels is not None and scored:
+            labels = np.asarray(truth.labels[number])
+            area_px = labelled_area(labels)
             for tag, epc in enumerate(names):
-                if epc in scored:
-                    rows[epc].append(
-                        (
-                            *_score_frame(masks[tag], boxes[tag], labels, scored[epc], settings),
-                            float(trace.confidence[tag]),
-                            bool(trace.detected[tag]),
-                        )
-                    )
-        for tag, epc in enumerate(names):
-            if epc in detections:
-                detections[epc].append(bool(trace.detected[tag]))
+                if epc not in scored:
+                    continue
+                row = _score_frame(masks[tag], boxes[tag], labels, scored[epc], area_px, settings)
+                row["confidence"] = float(trace.confidence[tag])
+                row["detected"] = bool(trace.detected[tag])
+                range_m = np.linalg.norm(np.asarray(trace.centre_m[tag], np.float64) - recording.antennas_m[0])
+                row["range_error_m"] = float(range_m - _at(truth.tag_range_m, epc, number))
+                rows[epc].append(row)
         if number in kept:
-            pictures.append(
-                Picture(
-                    number,
-                    tuple(names),
-                    np.stack([masks[tag] for tag in range(len(names))]),
-                    boxes,
-                    np.asarray(trace.confidence, np.float64),
-                    np.asarray(trace.detected, bool),
-                )
-            )
+            confidence = np.asarray(trace.confidence, np.float64)
+            ordered = np.stack([masks[tag] for tag in range(len(names))])
+            pictures.append(Picture(number, tuple(names), ordered, boxes, confidence, detected[-1]))
         if on_frame is not None:
             on_frame()
-    results = {epc: _tag_frames(recording, epc, scored[epc], rows[epc], (first, last), settings) for epc in scored}
-    unlabelled = {epc: np.array(frames_detected, dtype=bool) for epc, frames_detected in detections.items()}
-    return RecordingResult(recording, results, pictures, settings, unlabelled)
+    if truth is None or not scored:
+        return RecordingResult(recording, {}, pictures, settings)
+    tags = {epc: _tag_frames(recording, truth, epc, rows[epc], (first, last), settings) for epc in scored}
+    found = np.stack(detected)
+    unlabelled = {epc: found[:, tag] for tag, epc in enumerate(names) if epc not in scored}
+    multi_object = MultiObjectScores.of(_match_frames(tags, rows, names, np.stack(found_boxes), found))
+    return RecordingResult(recording, tags, pictures, settings, unlabelled, multi_object)
 
 
 def _score_frame(
-    mask: np.ndarray, box_px: np.ndarray, labels: np.ndarray, label: int, settings: ScoreSettings
-) -> tuple[float, float, float, int, bool]:
-    true_box = tracking.label_box(labels, label)
-    large_enough = int(np.sum(labels == label)) >= settings.min_pixels
-    whole = large_enough and not bool(
-        tracking.touches_border(true_box, tracking.labelled_area(labels), margin_px=settings.border_px)
-    )
-    return (
-        float(tracking.box_iou(box_px, true_box)),
-        float(tracking.centre_error(box_px, true_box, labels.shape[1])),
-        tracking.mask_iou(mask, labels, label),
-        tracking.best_covered_label(mask, labels, min_pixels=settings.min_pixels),
-        whole,
-    )
+    mask: np.ndarray,
+    box_px: np.ndarray,
+    labels: np.ndarray,
+    label: int,
+    area_px: np.ndarray,
+    settings: ScoreSettings,
+) -> dict[str, Any]:
+    true_box, true = label_box(labels, label), labels == label
+    large_enough = int(np.sum(true)) >= settings.min_pixels
+    whole = large_enough and not bool(touches_border(true_box, area_px, margin_px=settings.border_px))
+    tolerances = boundary_tolerances_px(*labels.shape)
+    counted = labels != Truth.IGNORE
+    return {
+        "true_box_px": true_box,
+        "iou": float(box_iou(box_px, true_box)),
+        "cle_px": float(centre_error(box_px, true_box, labels.shape[1])),
+        "mask_j": mask_iou(mask, labels, label),
+        "boundary_f": boundary_f(mask & counted, true, tolerances) if whole else np.full(len(tolerances), np.nan),
+        "identified": best_covered_label(mask, labels, min_pixels=settings.min_pixels),
+        "visible": whole,
+    }
+
+
+def _at(values: Mapping[Any, Any], key: Any, frame: int) -> float:
+    """An element of a truth's array; NaN where there is none."""
+    return float(values[key][frame]) if key in values else float("nan")
 
 
 def _tag_frames(
     recording: Recording,
+    truth: Truth,
     epc: str,
-    label: int,
-    rows: list[tuple[Any, ...]],
+    rows: Sequence[Mapping[str, Any]],
     frames: tuple[int, int],
     settings: ScoreSettings,
 ) -> FrameScores:
-    truth = recording.truth
-    if truth is None:
-        raise RecordingError(f"{recording.name}: there is no truth to score {epc} against.")
-    part = slice(*frames)
-    time_s = recording.frame_time_s()
-    iou, cle_px, mask_j, identified, visible, confidence, detected = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
+    part, label = slice(*frames), truth.tag_to_label[epc]
+    time_s, frame = recording.frame_time_s(), np.arange(recording.num_frames)
+    begin = first_motion(truth, epc, time_s, min_speed_m_s=settings.min_speed_m_s)
+    since = np.full(len(frame), -len(frame)) if begin is None else frame - begin
+    elapsed_s = time_s - (time_s[begin] if begin is not None else np.inf)
+    until_s = np.inf if settings.until_s is None else settings.until_s
+    visible = np.array([row["visible"] for row in rows], dtype=bool)
     if label in truth.visible:
-        visible = visible & np.asarray(truth.visible[label], bool)[part]
-    has_moved = tracking.moved_for(
-        truth,
-        epc,
-        time_s,
-        settings.moved_for_s,
-        min_speed_m_s=settings.min_speed_m_s,
-        restarts=settings.moved_restarts,
-    )
-    if settings.frames is not None:
-        number = np.arange(len(has_moved))
-        has_moved = has_moved & (number >= settings.frames[0]) & (number < settings.frames[1])
+        visible &= np.asarray(truth.visible[label], bool)[part]
+    reads, rssi_dbm = recent_reads(recording, epc)
+    sight = np.asarray(truth.line_of_sight.get(epc, np.full(len(frame), np.nan)), np.float64)
+    columns = {name: np.array([row[name] for row in rows]) for name in ("iou", "cle_px", "mask_j", "range_error_m")}
     return FrameScores(
         time_s=time_s[part],
-        iou=iou.astype(np.float64),
-        cle_px=cle_px.astype(np.float64),
-        mask_j=mask_j.astype(np.float64),
-        identified=identified.astype(np.int64),
-        confidence=confidence.astype(np.float64),
-        detected=detected.astype(bool),
-        visible=visible.astype(bool),
-        has_moved=has_moved[part],
+        **{name: values.astype(np.float64) for name, values in columns.items()},
+        boundary_f=np.array([row["boundary_f"] for row in rows]).reshape(-1, len(BOUNDARY_PX) + 1),
+        identified=np.array([row["identified"] for row in rows], dtype=np.int64),
+        confidence=np.array([row["confidence"] for row in rows], dtype=np.float64),
+        detected=np.array([row["detected"] for row in rows], dtype=bool),
+        visible=visible,
+        since_motion=since[part],
+        selected=((elapsed_s >= settings.from_s - 1e-9) & (elapsed_s < until_s))[part],
+        reads=reads[part],
+        rssi_dbm=rssi_dbm[part],
+        line_of_sight=sight[part],
         label=label,
+        moves=begin is not None,
     )
+
+
+def recent_reads(recording: Recording, epc: str, *, seconds: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A tag's number of reads in the time before each frame, (num_frames,), and their mean RSSI, dBm; NaN without a read."""
+    reads = recording.reads[recording.reads.epc == epc]
+    until = np.searchsorted(reads.time_ns, recording.time_ns, side="right")
+    since = np.searchsorted(reads.time_ns, recording.time_ns - round(seconds * 1e9), side="right")
+    known = np.isfinite(reads.rssi_dbm)
+    sums = np.concatenate([[0.0], np.cumsum(np.where(known, reads.rssi_dbm, 0.0), dtype=np.float64)])
+    counts = np.concatenate([[0], np.cumsum(known)])
+    number = counts[until] - counts[since]
+    mean_dbm = np.where(number > 0, (sums[until] - sums[since]) / np.maximum(number, 1), np.nan)
+    return until - since, mean_dbm
+
+
+def _match_frames(
+    tags: Mapping[str, FrameScores],
+    rows: Mapping[str, Sequence[Mapping[str, Any]]],
+    names: Sequence[str],
+    found_boxes: np.ndarray,
+    detected: np.ndarray,
+) -> list[MatchFrame]:
+    """Every frame's true boxes and detections, without the objects that do not count and the detections of these.
+
+    Of two tags on one object only the first is matched: one track of two would be false by definition.
+    """
+    owner = {tags[epc].label: epc for epc in reversed(list(tags))}
+    extra = {epc for epc, frames in tags.items() if owner[frames.label] != epc}
+    columns = np.array([tag for tag, epc in enumerate(names) if epc not in extra], dtype=int)
+    labels = np.array(sorted(owner), dtype=int)
+    valid = np.stack([tags[owner[int(label)]].valid for label in labels], axis=1)
+    true_boxes = np.stack([[row["true_box_px"] for row in rows[owner[int(label)]]] for label in labels], axis=1)
+    matches = []
+    for frame in range(len(detected)):
+        there = np.isfinite(true_boxes[frame]).all(axis=-1)
+        found = columns[detected[frame, columns]]
+        overlap = box_iou(
+            np.repeat(true_boxes[frame][there][:, None], len(found), axis=1),
+            np.repeat(found_boxes[frame][found][None], int(there.sum()), axis=0),
+        )
+        one = MatchFrame(labels[there], found, overlap)
+        matches.append(one.without_ignored(labels[~valid[frame]]))
+    return matches

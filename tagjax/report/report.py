@@ -13,15 +13,28 @@ from rich.table import Table
 
 from ..core.names import plain_label, safe_file_name
 from ..core.results import write_csv, write_json
+from ..metrics.boxes import label_box
 from ..metrics.recordings import RecordingResult
-from ..metrics.tracking import Scores, label_box
+from ..metrics.tags import Scores
 from ..recording.image_files import write_image
 from .overlay import draw_overlay, short_name
 
 Results = Mapping[str, Sequence[RecordingResult]]
 """Results of each tracer, by name, one element a recording; the recordings are the same for all."""
 
-_COLUMNS = ("iou", "cle_px", "mask_j", "identified", "confidence", "detected", "visible", "has_moved")
+_COLUMNS = (
+    "iou",
+    "cle_px",
+    "mask_j",
+    "identified",
+    "confidence",
+    "detected",
+    "visible",
+    "since_motion",
+    "reads",
+    "rssi_dbm",
+    "line_of_sight",
+)
 
 
 def summarise(results: Results) -> dict[str, Any]:
@@ -125,13 +138,13 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
         "cle_px": "CLE px",
         "mask_j": "J",
         "identification": "ident.",
-        "detected": "detect.",
+        "p_d": "P_D",
         "locked": "locked",
         "time_to_lock_s": "lock s",
         "num_frames": "frames",
     }
-    if any(scores["all"].get("false_detections") is not None for scores in summary.values()):
-        columns["false_detections"] = "false det."
+    if any(scores["all"].get("p_fa") is not None for scores in summary.values()):
+        columns["p_fa"] = "P_FA"
     rows = [[_cell(scores["all"].get(name)) for name in columns] for scores in summary.values()]
     table = Table(title=title, box=SIMPLE, pad_edge=False, collapse_padding=True)
     table.add_column("tracer", no_wrap=True)

@@ -17,7 +17,7 @@ from ...core.files import write_atomic
 from ...core.results import write_json
 from ...core.settings import ConfigError, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
-from ...metrics.tracking import Scores
+from ...metrics.tags import Scores
 from ...recording import Recording, RecordingError
 from ...recording.store import open_recording
 from ...report.comparison import bar_plot
@@ -149,7 +149,7 @@ def _cell(
         scores.get("iou"),
         scores.get("cle_px"),
         float(np.median(error_m)) * 1e3 if len(error_m) else None,
-        scores.get("detected"),
+        scores.get("p_d"),
         float(np.mean(false_alarms)) if len(false_alarms) else None,
         float(np.median(tally.frame_ms)),
         settings=", ".join(labels) or None,

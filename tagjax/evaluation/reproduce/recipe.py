@@ -22,8 +22,8 @@ Split = Literal["train", "validation", "test"]
 COUNTS = ("num_recordings", "num_tags", "num_frames")
 """Measures that count the items over which a cell's scores are averaged."""
 
-MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "false_detections", *COUNTS)
-"""Measures that a column can show: scores of `tagjax.metrics.tracking.Scores`, `locked` (of all tags), and counts."""
+MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "p_fa", *COUNTS)
+"""Measures that a column can show: scores of `tagjax.metrics.tags.Scores`, `locked` (of all tags), and counts."""
 
 
 @dataclasses.dataclass(frozen=True)

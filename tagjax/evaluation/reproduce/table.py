@@ -13,7 +13,7 @@ import numpy as np
 
 from ...core.machine import machine
 from ...core.results import write_json
-from .interval import LEVEL, NUM_RESAMPLES, SEED, ratio_estimate
+from ...metrics.interval import LEVEL, NUM_RESAMPLES, SEED, ratio_estimate
 from .provenance import dependencies, revision
 from .recipe import COUNTS, Column, Job, Recipe, Row
 from .scores import RecordingScores
