@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
+
+from .mean import MaskedMean
 
 LEVEL = 0.95
 NUM_RESAMPLES = 2000
@@ -48,3 +51,16 @@ def ratio_estimate(totals: Float[np.ndarray, " recording"], counts: Int[np.ndarr
         )
         low, high = (float(end) for end in drawn.confidence_interval)
     return Estimate(value, low, high, float(total.sum()), int(count.sum()), len(count))
+
+
+def estimates(recordings: Sequence[Mapping[str, MaskedMean]]) -> dict[str, Estimate]:
+    """`ratio_estimate` of each named mean, from the means of each recording."""
+    names = dict.fromkeys(name for means in recordings for name in means)
+    none = MaskedMean()
+    return {
+        name: ratio_estimate(
+            np.array([means.get(name, none).total for means in recordings], np.float64),
+            np.array([means.get(name, none).count for means in recordings], np.int64),
+        )
+        for name in names
+    }

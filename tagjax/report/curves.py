@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
+from ..metrics.curves import Curve
 from .figure import blank, save_figure
 
 
@@ -47,4 +48,31 @@ def score_curves(
     lower.set(ylabel="CLE (px of 512)", xlabel="frame number (shaded: not scored)")
     lower.set_ylim(bottom=0)
     upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=4)  # beside the title
+    save_figure(figure, path, dpi=110)
+
+
+_PANELS = {"iou": "box IoU", "cle_px": "CLE (px of 512)", "identification": "identified"}
+
+
+def band_curves(path: Path, curves: Mapping[str, Mapping[str, Curve]]) -> None:
+    """Write a PNG with the scores of each tracer against frames since the first motion, with their bands by recording.
+
+    A curve ends where less than half of the tags are left that it had at its fullest.
+    """
+    figure = blank(8.0, 6.5)
+    panels = figure.subplots(len(_PANELS), 1, sharex=True)
+    for axes, (score, label) in zip(panels, _PANELS.items(), strict=True):
+        for tracer, by_score in curves.items():
+            curve = by_score[score]
+            enough = 2 * curve.num_tags >= curve.num_tags.max(initial=0)
+            frame = np.arange(len(curve.mean))
+            (line,) = axes.plot(frame, np.where(enough, curve.mean, np.nan), label=tracer, linewidth=1.4)
+            axes.fill_between(
+                frame, curve.low, curve.high, where=enough.tolist(), color=line.get_color(), alpha=0.18, linewidth=0
+            )
+        axes.grid(alpha=0.3)
+        axes.set(ylabel=label)
+        axes.set_ylim(bottom=0, top=None if score == "cle_px" else 1.02)
+    panels[-1].set(xlabel="frames since the tag's first motion (band: 95 % interval of the mean, by recording)")
+    panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=4)
     save_figure(figure, path, dpi=110)

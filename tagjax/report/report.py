@@ -14,6 +14,8 @@ from rich.table import Table
 from ..core.names import plain_label, safe_file_name
 from ..core.results import write_csv, write_json
 from ..metrics.boxes import label_box
+from ..metrics.curves import motion_curves
+from ..metrics.interval import estimates
 from ..metrics.recordings import RecordingResult
 from ..metrics.tags import Scores
 from ..recording.image_files import write_image
@@ -38,7 +40,7 @@ _COLUMNS = (
 
 
 def summarise(results: Results) -> dict[str, Any]:
-    """Plain JSON: for each tracer the scores of all, of each recording and of each tag."""
+    """Plain JSON: for each tracer the scores of all with their 95 % intervals by recording, of each recording and of each tag."""
     summary: dict[str, Any] = {}
     for tracer, ones in results.items():
         total = Scores()
@@ -47,7 +49,9 @@ def summarise(results: Results) -> dict[str, Any]:
             total = total.merge(one.scores())
             tags = {epc: scores.result() for epc, scores in one.tag_scores().items()}
             recordings[_recording_name(ones, number)] = {"all": one.scores().result(), "tags": tags}
-        summary[tracer] = {"all": total.result(), "recordings": recordings}
+        whole = estimates([one.scores().means for one in ones])
+        intervals = {name: [one.low, one.high] for name, one in whole.items() if one.low is not None}
+        summary[tracer] = {"all": total.result(), "intervals": intervals, "recordings": recordings}
     return summary
 
 
@@ -62,6 +66,7 @@ def write_report(folder: Path, results: Results) -> dict[str, Any]:
                 folder / "overlays" / safe_file_name(_recording_name(ones, number)) / safe_file_name(tracer), one
             )
     write_curves(folder / "curves", results)
+    write_motion_curves(folder, results)
     return summary
 
 
@@ -129,6 +134,25 @@ def write_curves(folder: Path, results: Results) -> None:
             offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
             path = folder / f"{safe_file_name(f'{name}_{epc}')}.png"
             score_curves(path, lines, frames.valid, first_frame=offset, title=plain_label(f"{name}: {epc}"))
+
+
+def write_motion_curves(folder: Path, results: Results) -> None:
+    """Scores against frames since the first motion, means over recordings with their bands: a CSV, and a figure of it."""
+    curves = {tracer: motion_curves([one.frames for one in ones]) for tracer, ones in results.items()}
+    rows = [
+        (tracer, frame, name, *(f"{value:.6g}" for value in values), number)
+        for tracer, by_name in curves.items()
+        for name, curve in by_name.items()
+        for frame, (*values, number) in enumerate(zip(curve.mean, curve.low, curve.high, curve.num_tags, strict=True))
+    ]
+    write_csv(folder / "motion_curves.csv", ("tracer", "frame", "score", "mean", "low", "high", "num_tags"), rows)
+    if not rows:
+        return
+    try:
+        from .curves import band_curves
+    except ImportError:
+        return  # `write_curves` has warned
+    band_curves(folder / "motion_curves.png", curves)
 
 
 def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
