@@ -1,6 +1,6 @@
 """The text of `--help`: what the command does, its groups with their choices, and every key with its comment.
 
-It is the help template in conf/hydra/default.yaml, so overrides have an effect: `--help tracer=tagattention_paper` shows
+It is the help template in conf/hydra/default.yaml, so overrides have an effect: `--help tracer=tagattention_published` shows
 the keys of that tracer.
 """
 

@@ -22,7 +22,6 @@ _MAY_DIFFER = (
     "retune",
     "scores",
     "baselines",
-    "baseline_estimators",
     "matmul_precision",
 )
 _MAY_DIFFER_SUFFIXES = ("workers", "decay_steps")  # decay_steps follows loop.num_steps

@@ -94,7 +94,7 @@ def test_every_recipe_is_tested() -> None:
 
 def test_evaluation_configurations_are_valid() -> None:
     assert settings(EvaluateConfig, "evaluate").tracer is None
-    chosen = settings(EvaluateConfig, "evaluate", "tracer=tagattention_paper", "frames=[0,20]", "scores.lock_s=0.5")
+    chosen = settings(EvaluateConfig, "evaluate", "tracer=tagattention_literal", "frames=[0,20]", "scores.lock_s=0.5")
     assert chosen.tracer is not None
     assert isinstance(make_tracer(chosen.tracer), AbstractTracer)
     assert chosen.frames == (0, 20)
@@ -103,11 +103,12 @@ def test_evaluation_configurations_are_valid() -> None:
 
 def test_a_sweep_sees_the_clips_of_its_tracer() -> None:
     suites = {"suites": suites_named(["velocity_threshold"])}
-    for tracer, stride in (("tagattention_paper", 4), ("tagattention_handheld", 2)):
+    estimators = {"tagattention_published": "published", "tagattention_literal": "literal"}
+    for tracer, stride in (("tagattention_published", 2), ("tagattention_literal", 4)):
         values = composed("sweep_paper", f"tracer={tracer}")
         values.pop("progress")
         clips = from_mapping(SweepConfig, {**values, **suites}).clip_settings()
-        assert (clips.stride, clips.estimator) == (stride, "paper")
+        assert (clips.stride, clips.estimator) == (stride, estimators[tracer])
 
 
 def test_flow_evaluation_configurations_are_valid() -> None:
@@ -161,7 +162,7 @@ def test_every_story_has_tracer_settings_in_the_comparison() -> None:
         ("tagvision", "suite=planar_trcks", "planar_tracks"),
         ("evaluate", "suite=multi_5", "multi_4"),
         ("evaluate", "tracer=tagvision", "tagattention_handheld"),
-        ("evaluate", "tracer@baselines.paper=magic", "tagattention_paper"),
+        ("evaluate", "tracer@baselines.published=magic", "tagattention_published"),
         ("evaluate", "scores=as_traind", "as_trained"),
         ("train", "suite=multi_5", "multi_4"),
         ("train", "experiment=handhold", "handheld"),

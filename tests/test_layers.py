@@ -8,7 +8,7 @@ from pathlib import Path
 import equinox as eqx
 
 import tagjax.tagattention
-import tagjax.tagattention.paper
+import tagjax.tagattention.literal
 import tagjax.tracing.tracer
 
 ROOT = Path(__file__).parents[1]
@@ -99,7 +99,7 @@ def test_the_interface_of_the_baselines_needs_no_opencv():
 
 
 def test_tracers_are_abstract_or_final():
-    for module in (tagjax.tracing.tracer, tagjax.tagattention, tagjax.tagattention.paper):
+    for module in (tagjax.tracing.tracer, tagjax.tagattention, tagjax.tagattention.literal):
         for thing in vars(module).values():
             if isinstance(thing, type) and issubclass(thing, eqx.Module) and thing is not eqx.Module:
                 for base in thing.__bases__:

@@ -131,7 +131,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
 def test_a_tracer_without_learned_parameters_is_refused() -> None:
     with pytest.raises(ValueError, match="learned parameters are of TagAttention"):
-        make_tracer({"_target_": "tagjax.tagattention.paper.TagAttentionPaper"}, "default")
+        make_tracer({"_target_": "tagjax.tagattention.literal.TagAttentionLiteral"}, "default")
 
 
 def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:

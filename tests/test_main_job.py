@@ -23,7 +23,7 @@ from tagjax.recording.loading import VirtualTagSettings, with_virtual_tags
 from tagjax.recording.reads import join_reads
 from tagjax.recording.store import save_recording
 from tagjax.tagattention import TagAttention
-from tagjax.tagattention.paper import TagAttentionPaper
+from tagjax.tagattention.literal import TagAttentionLiteral
 from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.training import run as run_module
 from tagjax.training.config import TrainConfig
@@ -50,9 +50,9 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def _values(recordings: list[str]) -> dict:
     return {
         # Softened, the paper's tracer has parameters to learn, too; with it the test takes half as long.
-        "tracer": {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "softness": 0.3},
+        "tracer": {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "cell": 4, "softness": 0.3},
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},
-        "baselines": {"paper": {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4}},
+        "baselines": {"paper": {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "cell": 4}},
         "data": {
             "recordings": recordings[:1],
             "validation": recordings[1:],
@@ -151,7 +151,7 @@ def test_processes_join_before_anything_asks_for_devices(
 def test_smoothing_that_the_tracer_cannot_do_is_refused_before_the_work(recordings: list[str], tmp_path: Path) -> None:
     values = _values(recordings)
     values["scores"]["smooth"] = True
-    with pytest.raises(ConfigError, match=r"scores\.smooth is true, which TagAttentionPaper does not support"):
+    with pytest.raises(ConfigError, match=r"scores\.smooth is true, which TagAttentionLiteral does not support"):
         run_training(from_mapping(TrainConfig, values), tmp_path)
     assert not list(tmp_path.iterdir())
 
@@ -252,6 +252,6 @@ def test_reads_of_unlike_conventions_are_not_joined() -> None:
 
 
 def test_a_tracer_of_one_antenna_gets_the_given_one_or_else_the_busiest() -> None:
-    one, several = TagAttentionPaper(), TagAttention()
+    one, several = TagAttentionLiteral(), TagAttention()
     assert [antennas_for(one, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), None, None]
     assert [antennas_for(several, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), (1, 2), "all"]

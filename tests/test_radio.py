@@ -25,7 +25,7 @@ from tagjax.radio.unwrap import remove_jump, unwrap_paper
 from tagjax.recording import TagReads
 from tagjax.tracing.motion_evidence import MIN_READS, coherence_loss
 from tagjax.tracing.range_windows import (
-    paper_windows,
+    literal_windows,
     phase_reads,
     radio_model,
     radio_windows,
@@ -421,7 +421,7 @@ def test_robust_steps_have_at_most_a_third_of_the_papers_error():
         reads = phase_reads(simulate_reads(rng, path, 10), "A", 0)
         frames = np.arange(300) / 30
         robust, known = _steps(radio_windows(reads, jnp.asarray(frames, jnp.float32), 5, "robust"), path(frames))
-        paper, also = _steps(radio_windows(reads, jnp.asarray(frames, jnp.float32), 5, "paper"), path(frames))
+        paper, also = _steps(radio_windows(reads, jnp.asarray(frames, jnp.float32), 5, "literal"), path(frames))
         both = known & also
         assert both.mean() > 0.9
         errors["robust"].append(robust[both])
@@ -474,7 +474,7 @@ def test_an_unknown_result_is_reported_as_unknown():
         nothing.time_s, nothing.phase_rad, nothing.carrier_hz, nothing.sigma_rad, nothing.channel, jnp.arange(4) == 0
     )
     for reads in (nothing, one):
-        for estimator in ("robust", "paper"):
+        for estimator in ("robust", "literal"):
             window = radio_windows(reads, frames, 5, estimator, RadioModel() if estimator == "robust" else None)
             assert bool(jnp.isinf(window.std_m[5:]).all())
             assert bool(jnp.isfinite(window.relative_m).all())
@@ -503,9 +503,9 @@ def test_jit_and_vmap_change_nothing():
     pair = [phase_reads(simulate_reads(rng, smooth_path(rng, 1.0, 3), 3), "A", 0) for _ in range(2)]
     frames = jnp.arange(20, dtype=jnp.float32) / 10
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pair)
-    together = jax.vmap(lambda r: paper_windows(r, frames, 5))(stacked)
+    together = jax.vmap(lambda r: literal_windows(r, frames, 5))(stacked)
     for i, reads in enumerate(pair):
-        np.testing.assert_allclose(together.relative_m[i], paper_windows(reads, frames, 5).relative_m, atol=1e-6)
+        np.testing.assert_allclose(together.relative_m[i], literal_windows(reads, frames, 5).relative_m, atol=1e-6)
 
 
 def rail_reads(folder, epc):

@@ -83,7 +83,7 @@ RECIPE: dict[str, Any] = {
         },
     ],
     "protocols": {"part": {"frames": [0, 30], "scores": {"from_s": 0.0}}},
-    "systems": {"online": {"tracer": "tagattention_paper", "clips": {"stride": 2}}},
+    "systems": {"online": {"tracer": "tagattention_literal", "clips": {"stride": 2}}},
     "depends": ["code/*.py", "recipe.yaml"],
 }
 
@@ -322,12 +322,12 @@ def test_every_measure_is_one_that_scores_have():
 
 
 def test_columns_of_a_row_may_be_of_other_systems():
-    systems = {"a": {"tracer": "tagattention_paper"}, "b": {"tracer": "tagattention_handheld"}}
+    systems = {"a": {"tracer": "tagattention_literal"}, "b": {"tracer": "tagattention_handheld"}}
     row = {"label": "a", "suite": "small", "protocol": "part", "system": {"iou": "a", "all": "b"}}
     recipe = _recipe(rows=[row], systems=systems)
     assert [job.system for job in recipe.jobs()] == ["a", "b"]
     assert recipe.job(recipe.rows[0], "locked") is None
-    assert recipe.tracers() == ["tagattention_paper", "tagattention_handheld"]
+    assert recipe.tracers() == ["tagattention_literal", "tagattention_handheld"]
 
 
 @pytest.mark.parametrize(
@@ -375,7 +375,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 def _inputs(folder: Path, **changed: Any) -> Inputs:
     code = {"code/one.py": "1" * 40, "recipe.yaml": "2" * 40}
-    tracers = {"tagattention_paper": _tracer("tagattention_paper")}
+    tracers = {"tagattention_literal": _tracer("tagattention_literal")}
     inputs = Inputs({"small": SUITE}, tracers, folder / "recordings", folder / "finished", code)
     return dataclasses.replace(inputs, **changed)
 
@@ -423,7 +423,7 @@ def test_an_interrupted_measurement_loses_one_recording_at_most(
         ({}, {"code": {"code/one.py": "1" * 40, "recipe.yaml": "3" * 40}}, 0),
         ({"title": "Another title"}, {}, 0),
         ({"protocols": {"part": {"frames": [0, 31], "scores": {"from_s": 0.0}}}}, {}, 4),
-        ({"systems": {"online": {"tracer": "tagattention_paper", "clips": {"stride": 4}}}}, {}, 4),
+        ({"systems": {"online": {"tracer": "tagattention_literal", "clips": {"stride": 4}}}}, {}, 4),
         ({}, {"suites": {"small": {**SUITE, "seed": 8}}}, 4),
         ({}, {"suites": {"small": {**SUITE, "about": "in other words"}}}, 0),
         ({}, {"suites": {"small": {**SUITE, "counts": {"train": 0, "validation": 0, "test": 3}}}}, 2),
@@ -457,7 +457,7 @@ def test_seeds_draw_recordings_anew(tmp_path: Path, traced: list[Path]):
     ("changed", "message"),
     [
         ({"suites": {}}, "found suite 'small'; expected one of none"),
-        ({"tracers": {"other": {}}}, "found tracer 'tagattention_paper'; expected one of other"),
+        ({"tracers": {"other": {}}}, "found tracer 'tagattention_literal'; expected one of other"),
         ({"suites": {"small": {**SUITE, "counts": {"test": 0}}}}, "small: found no test recording"),
     ],
 )
@@ -472,7 +472,7 @@ def test_a_table_is_made_with_all_that_its_values_can_be_computed_from(root: Pat
         recipe,
         root,
         suites={"small": SUITE},
-        tracers={"tagattention_paper": _tracer("tagattention_paper")},
+        tracers={"tagattention_literal": _tracer("tagattention_literal")},
         recordings=root / "recordings",
         finished=root / "finished",
         on_progress=lambda *step: steps.append(step),
@@ -510,7 +510,7 @@ def test_a_table_of_a_simulated_suite_is_made(root: Path):
         _recipe(protocols={"part": protocol}),
         root,
         suites={"small": suite},
-        tracers={"tagattention_paper": _tracer("tagattention_paper")},
+        tracers={"tagattention_literal": _tracer("tagattention_literal")},
         recordings=root / "recordings",
         finished=root / "finished",
     )

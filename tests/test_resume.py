@@ -38,9 +38,9 @@ def _train(recording: str, run: Path, *more: str) -> list[str]:
     return [
         *(sys.executable, "-m", "experiments.train"),
         f"data.recordings=[{recording}]",
-        *("data.clips.stride=4", "data.clips.length=8", "data.clips.estimator=paper"),
+        *("data.clips.stride=4", "data.clips.length=8", "data.clips.estimator=literal"),
         # The smallest to compile that learns.
-        *("tracer=tagattention_paper", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),
+        *("tracer=tagattention_literal", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),
         *(f"loop.num_steps={NUM_STEPS}", "loop.batch_size=2", "loop.checkpoint_every=4", "loop.progress=false"),
         *("objective.span_frames=4", "objective.skip_frames=3", "objective.max_reads=64", "objective.num_channels=4"),
         *("logger=disabled", f"hydra.run.dir={run}", *more),

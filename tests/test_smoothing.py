@@ -20,7 +20,7 @@ from tagjax.recording import Recording, RecordingError
 from tagjax.recording.store import open_recording
 from tagjax.recording.time_reversal import time_reversed
 from tagjax.tagattention import TagAttention
-from tagjax.tagattention.paper import TagAttentionPaper
+from tagjax.tagattention.literal import TagAttentionLiteral
 from tagjax.tracing.clips import Clip, ClipSettings, load_clip
 from tagjax.tracing.recordings import trace_recording
 from tagjax.tracing.tracer import BackwardMessage, Camera, Frame, Trace, trace
@@ -213,13 +213,13 @@ def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
 def test_a_forward_only_tracer_is_refused_for_smoothing(tmp_path: Path) -> None:
     recording = open_recording(synthetic.stored(tmp_path, 8)[0])
     settings = ScoreSettings(smooth=True, num_pictures=1, from_s=0.2)
-    with pytest.raises(RecordingError, match="TagAttentionPaper has no backward pass; expected TagAttention"):
-        next(trace_recording(TagAttentionPaper(), recording, _load, epcs=EPCS, settings=settings))
+    with pytest.raises(RecordingError, match="TagAttentionLiteral has no backward pass; expected TagAttention"):
+        next(trace_recording(TagAttentionLiteral(), recording, _load, epcs=EPCS, settings=settings))
     common = {
         "recordings": [recording],
         "clips": ClipSettings(stride=4, flow="zero"),
         "settings": settings,
         "progress": False,
     }
-    with pytest.raises(ConfigError, match=r"scores.smooth is true, which TagAttentionPaper does not support"):
-        evaluate_tracers({"paper": TagAttentionPaper()}, folder=tmp_path, **common)
+    with pytest.raises(ConfigError, match=r"scores.smooth is true, which TagAttentionLiteral does not support"):
+        evaluate_tracers({"paper": TagAttentionLiteral()}, folder=tmp_path, **common)

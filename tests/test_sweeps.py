@@ -52,7 +52,7 @@ def _run(command: list[str]) -> str:
 
 def _evaluate(recordings: list[str], sweep: Path, *more: str) -> list[str]:
     return [
-        *(sys.executable, "-m", "experiments.evaluate", "-m", "tracer=tagattention_paper", "progress=false"),
+        *(sys.executable, "-m", "experiments.evaluate", "-m", "tracer=tagattention_literal", "progress=false"),
         *(f"recordings=[{recordings[0]}]", "clips.stride=4", "frames=[0,8]", "tracer.cell=4", "scores.num_pictures=1"),
         *("tracer.v0_m_s=0.01,0.1", f"hydra.sweep.dir={sweep}", *more),
     ]
@@ -111,7 +111,7 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
     storage = tmp_path / "optuna.db"
     command = [
         *(sys.executable, "-m", "experiments.train", "-m", "hparams_search=optuna", "logger=disabled"),
-        *(f"data.recordings=[{recordings[0]}]", f"data.validation=[{recordings[1]}]", "tracer=tagattention_paper"),
+        *(f"data.recordings=[{recordings[0]}]", f"data.validation=[{recordings[1]}]", "tracer=tagattention_literal"),
         *("data.clips.stride=4", "data.clips.length=8", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),
         *("loop.num_steps=1", "loop.checkpoint_every=1", "loop.validate_every=1", "loop.progress=false"),
         *("objective.span_frames=4", "objective.skip_frames=3", "objective.max_reads=64", "objective.num_channels=4"),
@@ -249,7 +249,7 @@ SUITE = {
     "counts": {"train": 0, "validation": 0, "test": 1},
     "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
 }
-PAPER = {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
+PAPER = {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
 
 
 def _config(folder: Path, **settings) -> SweepConfig:

@@ -14,8 +14,8 @@ from tagjax.radio.reads import RadioWindow
 from tagjax.recording import Intrinsics
 from tagjax.tagattention import TagAttention, paper_limit
 from tagjax.tagattention.frame_trace import describe
+from tagjax.tagattention.literal import FLOOR, TagAttentionLiteral
 from tagjax.tagattention.motion import empty_motion, push_gather, push_splat
-from tagjax.tagattention.paper import FLOOR, TagAttentionPaper
 from tagjax.tracing.clips import load_clip
 from tagjax.tracing.tracer import BackwardMessage, Camera, Frame, trace
 
@@ -167,7 +167,7 @@ def test_a_second_antenna_splits_what_one_cannot():
     for tag in range(2):
         assert (mask[tag] & boxes[tag]).sum() / (mask[tag] | boxes[tag]).sum() > 0.6
     with pytest.raises(ValueError, match=r"one antenna; the clip has 2"):
-        TagAttentionPaper().init(camera, jax.tree.map(lambda leaf: leaf[0], frames))
+        TagAttentionLiteral().init(camera, jax.tree.map(lambda leaf: leaf[0], frames))
 
 
 @pytest.mark.ci
@@ -184,7 +184,7 @@ def test_scan_is_the_loop_of_steps(clip):
     assert jax.tree.map(jnp.shape, tracer.finish(state)) == shapes
 
 
-@pytest.mark.parametrize("tracer", [_learnable(), TagAttentionPaper(cell=4)])
+@pytest.mark.parametrize("tracer", [_learnable(), TagAttentionLiteral(cell=4)])
 def test_a_step_gives_back_the_state_that_it_takes(clip, tracer):
     """In shape and type, weak or not: else the second frame of a recording compiles the step once more."""
     first = jax.tree.map(lambda leaf: leaf[0], clip.frames)
@@ -214,7 +214,7 @@ def _degenerate(frames: Frame):
     "tracer",
     [
         pytest.param(_learnable(rest_doubt=0.3), id="learnable", marks=pytest.mark.ci),
-        pytest.param(TagAttentionPaper(cell=4), id="paper", marks=pytest.mark.ci),
+        pytest.param(TagAttentionLiteral(cell=4), id="paper", marks=pytest.mark.ci),
     ],
 )
 def test_gradients_reach_every_parameter_and_stay_finite_at_degenerate_input(clip, tracer):
@@ -237,7 +237,7 @@ def test_gradients_reach_every_parameter_and_stay_finite_at_degenerate_input(cli
 
 def test_paper_update_is_equation_7(clip):
     """Without the refinement, the likelihood is the running sum of gated log attentions, carried by the flow."""
-    tracer = TagAttentionPaper(refine=False)
+    tracer = TagAttentionLiteral(refine=False)
     frames = clip.frames
     state = tracer.init(clip.camera, jax.tree.map(lambda leaf: leaf[0], frames))
     rays = np.asarray(clip.camera.rays)
@@ -273,10 +273,10 @@ def test_the_soft_tracer_has_the_paper_as_its_limit(clip):
     frames = jax.tree.map(lambda leaf: leaf[:12], clip.frames)
     # Without K-means, whose hard assignments tie in a scene seen through so long a lens.
     run = eqx.filter_jit(trace)
-    paper = run(TagAttentionPaper(refine=False), clip.camera, frames)
+    paper = run(TagAttentionLiteral(refine=False), clip.camera, frames)
     gaps = []
     for softness in (0.3, 1e-2, 1e-7):
-        soft = run(TagAttentionPaper(refine=False, softness=softness), clip.camera, frames)
+        soft = run(TagAttentionLiteral(refine=False, softness=softness), clip.camera, frames)
         gaps.append(float(jnp.mean(jnp.abs(soft.mask - paper.mask))))
     assert gaps[2] < 1e-3
     assert gaps[0] > gaps[2]
@@ -284,9 +284,9 @@ def test_the_soft_tracer_has_the_paper_as_its_limit(clip):
 
 def test_the_learnable_tracer_has_the_paper_as_its_limit():
     """At `paper_limit` likelihood and mask are those of the paper's tracer, and they part when a step is relaxed."""
-    clip = load_clip(synthetic.recording(24), 0, 24, stride=1, estimator="paper")
+    clip = load_clip(synthetic.recording(24), 0, 24, stride=1, estimator="literal")
     first = jax.tree.map(lambda leaf: leaf[0], clip.frames)
-    paper = TagAttentionPaper(refine=False)
+    paper = TagAttentionLiteral(refine=False)
 
     def run(tracer, like):
         def one(state, frame):

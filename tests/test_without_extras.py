@@ -78,7 +78,7 @@ def test_a_recording_is_trained_on_evaluated_and_traced_without_mujoco_and_matpl
     for seed in range(2):
         scene = synthetic.enlarged(synthetic.recording(26, seed=seed, name=f"scene{seed}"), 4)
         save_recording(scene, tmp_path / f"scene{seed}.zarr")
-    tracer = {"_target_": "tagjax.tagattention.paper.TagAttentionPaper", "cell": 4, "softness": 0.3}
+    tracer = {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "cell": 4, "softness": 0.3}
     values = {
         "tracer": tracer,
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.03},

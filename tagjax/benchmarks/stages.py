@@ -156,7 +156,7 @@ def _radio(settings: BenchmarkSettings) -> Timing:
     time_s = jnp.asarray(recording.frame_time_s(), jnp.float32)
     compile_s = first_call_s(lambda: radio_windows(reads, time_s, 5, "robust"))
     ours = median_ms(lambda: radio_windows(reads, time_s, 5, "robust"), settings.repeats)
-    peer = median_ms(lambda: radio_windows(reads, time_s, 5, "paper"), settings.repeats)
+    peer = median_ms(lambda: radio_windows(reads, time_s, 5, "literal"), settings.repeats)
     return Timing(f"robust radio, {recording.num_frames} frames, one tag", ours, "paper's radio", peer, compile_s)
 
 

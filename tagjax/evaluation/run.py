@@ -11,7 +11,7 @@ from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
 from ..recording.loading import VirtualTagSettings, open_recordings
-from ..tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from ..tagattention.tracer_settings import baseline_clips, learned_tracer, make_tracer, tracer_clips
 from ..tracing.clips import ClipSettings
 from ..training.checkpoint import Checkpoints
 from ..training.config import TrainConfig
@@ -48,7 +48,6 @@ def run_evaluation(
     Raises `ConfigError` where there is no tracer or no recording.
     """
     clips, scores, baselines, recordings = ClipSettings(), ScoreSettings(), dict(config.baselines or {}), []
-    estimators = dict(config.baseline_estimators or {})
     flows: dict[str, str] = {}
     if config.run is not None:
         if run_values is None:
@@ -59,7 +58,6 @@ def run_evaluation(
         flows = {"learned": evaluation_flow(state.model, trained, folder / "flow.safetensors")}
         clips, scores = trained.data.clips, trained.scores
         baselines = dict(trained.baselines) if config.baselines is None else baselines
-        estimators = dict(trained.baseline_estimators) | estimators
         if not config.recordings:
             recordings = validation_recordings(trained.data)
     elif config.weights is not None:
@@ -85,8 +83,7 @@ def run_evaluation(
         recordings,
         folder,
         clips=clips,
-        estimators=estimators,
-        flows=flows,
+        own_clips=baseline_clips(baselines) | {name: {"flow": flow} for name, flow in flows.items()},
         settings=changed(scores, config.scores, where="scores"),
         epcs=epcs,
         frames=config.frames,
@@ -109,7 +106,6 @@ class EvaluateConfig:
         default_factory=dict
     )  # override those of the run, the weights or the tracer
     baselines: Mapping[str, Mapping[str, Any]] | None = None
-    baseline_estimators: Mapping[str, str] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
     scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # override those of the run
     progress: bool = True

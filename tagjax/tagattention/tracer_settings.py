@@ -15,11 +15,13 @@ from ..tracing.clips import ClipSettings
 from ..tracing.tracer import AbstractTracer
 from . import TagAttention
 from .learned import load_parameters, read_learned
-from .paper import TagAttentionPaper
+from .literal import TagAttentionLiteral
+from .published import TagAttentionPublished
 
 TRACERS: dict[str, type[AbstractTracer]] = {
     "tagjax.tagattention.TagAttention": TagAttention,
-    "tagjax.tagattention.paper.TagAttentionPaper": TagAttentionPaper,
+    "tagjax.tagattention.published.TagAttentionPublished": TagAttentionPublished,
+    "tagjax.tagattention.literal.TagAttentionLiteral": TagAttentionLiteral,
 }
 """The tracers that settings can name as `_target_`."""
 
@@ -44,6 +46,11 @@ def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> Abst
 def tracer_clips(settings: Mapping[str, Any]) -> ClipSettings:
     """The clip settings of a tracer's configuration; the defaults for what it does not name."""
     return changed(ClipSettings(), settings.get("clips") or {}, where="tracer.clips")
+
+
+def baseline_clips(baselines: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """The clip settings that each baseline's configuration names; a baseline uses the main tracer's for the others."""
+    return {name: settings.get("clips") or {} for name, settings in baselines.items()}
 
 
 def learned_tracer(weights: str, settings: Mapping[str, Any] | None = None) -> tuple[AbstractTracer, ClipSettings]:

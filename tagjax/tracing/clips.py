@@ -21,7 +21,7 @@ from ..recording import Recording, RecordingError, RecordingWarning
 from .range_windows import host_reads, radio_windows, window_reads
 from .tracer import Camera, Frame
 
-Estimator = Literal["robust", "paper", "truth"]
+Estimator = Literal["robust", "published", "published_causal", "literal", "truth"]
 """Range estimator; `truth` uses the true ranges of a simulated recording, to measure what radio errors cost."""
 
 Antennas = tuple[int, ...] | Literal["all"] | None
@@ -54,6 +54,11 @@ def check_clip(*, stride: int = 1, window: int = 2, max_reads: int = 1) -> None:
     ):
         if value < minimum:
             raise ValueError(f"{name} is {value}; expected at least {minimum} ({meaning}).")
+
+
+def window_frames(seconds: float, frame_rate_hz: float) -> int:
+    """The number of frames of a motion vector over a time: at least 2, and 2 where the frame rate is unknown."""
+    return max(2, 1 + round(seconds * frame_rate_hz)) if np.isfinite(frame_rate_hz) else 2
 
 
 def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antennas = None) -> tuple[int, ...]:
@@ -133,6 +138,7 @@ def load_clip(
     epcs: Sequence[str] | None = None,
     flow: str = "dis",
     window: int = 5,
+    window_s: float | None = None,
     max_reads: int = 64,
     estimator: Estimator = "robust",
     antennas: Antennas = None,
@@ -140,13 +146,15 @@ def load_clip(
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
-    `stride` keeps every n-th pixel in both directions. Ranges are estimated causally from the recording's start, so that
+    `stride` keeps every n-th pixel in both directions. A motion vector has `window` frames, or as many as cover `window_s`
+    seconds at the recording's frame rate. Ranges are estimated causally from the recording's start, so that
     a clip in the middle uses the reads before it. The constants of the reader (probability of pi flips, slope and spread
     of the channel offsets, mean carrier: `radio_model`) are fitted to all reads of the tag. `antennas` chooses the
     antennas (see `choose_antennas`). With `colour` the clip holds the pictures, and zeros in place of the flow, which
     a network then computes. Raises `RecordingError` for an unknown EPC or antenna or a recording without depth, and
     `ValueError` for frames outside the recording or settings that no clip can have.
     """
+    window = window if window_s is None else window_frames(window_s, recording.frame_rate_hz)
     check_clip(stride=stride, window=window, max_reads=max_reads)
     if not 0 <= start < stop <= recording.num_frames:
         raise ValueError(f"Frames {start} to {stop} asked for; {recording.name} has {recording.num_frames}.")
@@ -243,6 +251,7 @@ class ClipSettings:
 
     stride: int = 4  # every n-th pixel in both directions
     window: int = 5  # frames in a motion vector (k)
+    window_s: float | None = None  # seconds that it covers, which then determine the number of frames
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
     estimator: Estimator = "robust"  # of the tags' distances
@@ -257,6 +266,8 @@ class ClipSettings:
         check_clip(stride=self.stride, window=self.window, max_reads=self.max_reads)
         if self.length < self.window:
             raise ConfigError(f"length is {self.length}; expected at least the window's {self.window} frames.")
+        if self.window_s is not None and not self.window_s > 0:
+            raise ConfigError(f"window_s is {self.window_s}; expected a positive time, or null for `window` frames.")
         if not 0 <= self.min_motion < 1:
             raise ConfigError(f"min_motion is {self.min_motion}; expected a loss of coherence, from 0 to less than 1.")
         if self.max_tags is not None and self.max_tags < 1:
@@ -264,7 +275,7 @@ class ClipSettings:
 
     def arguments(self) -> dict[str, Any]:
         """The arguments that `load_clip` and `clip_dataset` both have, by name."""
-        names = ("stride", "flow", "window", "max_reads", "estimator", "antennas")
+        names = ("stride", "flow", "window", "window_s", "max_reads", "estimator", "antennas")
         return {name: getattr(self, name) for name in names}
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..core.numerics import SPEED_OF_LIGHT_M_S
 from ..radio.bayes_filter import FilteredPath, RadioModel, filter_reads, reference_carrier
 from ..radio.channels import estimate_slope
 from ..radio.noise import estimate_flip_probability, thermal_sigma_rad
+from ..radio.published import published_distance
 from ..radio.reads import PhaseReads, RadioWindow
 from ..radio.refine import refine_path
 from ..radio.resample import resample_polynomial
@@ -176,8 +178,8 @@ def robust_windows(
     return jax.vmap(one)(knots, recent)
 
 
-def paper_windows(reads: PhaseReads, frame_time_s: Float[Array, " time"], num_window: int) -> RadioWindow:
-    """Range estimation of TagAttention (III.B-C): threshold unwrapping, acceleration rule, polynomial resampling.
+def literal_windows(reads: PhaseReads, frame_time_s: Float[Array, " time"], num_window: int) -> RadioWindow:
+    """Range estimation of TagAttention (III.B-C), term by term: threshold unwrapping, acceleration rule, polynomial resampling.
 
     The paper interpolates offline, so a frame also uses the reads right after it. `std_m` is 0 between the first and the
     last read and infinite outside: the paper estimates no uncertainty.
@@ -185,11 +187,25 @@ def paper_windows(reads: PhaseReads, frame_time_s: Float[Array, " time"], num_wi
     distance = unwrap_paper(reads)
     count = jnp.sum(reads.valid).astype(reads.time_s.dtype)
     value, inside = resample_polynomial(reads.time_s, distance, count, frame_time_s)
-    index = jnp.maximum(jnp.arange(frame_time_s.shape[0])[:, None] - jnp.arange(num_window - 1, -1, -1)[None, :], 0)
+    return _windows_of(value, inside, num_window)
+
+
+def published_windows(
+    reads: PhaseReads, frame_time_s: Float[Array, " time"], num_window: int, *, causal: bool = False
+) -> RadioWindow:
+    """Range estimation of TagAttention (III.B-C) as of `published_distance`; `std_m` is 0 where known, infinite elsewhere.
+
+    The fit at a frame uses reads up to 0.07 s after it, 0.2 s where reads are few, and none after it with `causal`.
+    """
+    value, known = published_distance(reads, frame_time_s, causal=causal)
+    return _windows_of(value, known, num_window)
+
+
+def _windows_of(value: Float[Array, " time"], known: Bool[Array, " time"], num_window: int) -> RadioWindow:
+    """The windows of a path; a window of which one distance is unknown is unknown."""
+    index = jnp.maximum(jnp.arange(value.shape[0])[:, None] - jnp.arange(num_window - 1, -1, -1)[None, :], 0)
     relative = value[index] - value[index[:, :1]]
-    complete = jnp.all(inside[index], axis=1, keepdims=True) & (
-        jnp.arange(frame_time_s.shape[0])[:, None] >= num_window - 1
-    )
+    complete = jnp.all(known[index], axis=1, keepdims=True) & (jnp.arange(value.shape[0])[:, None] >= num_window - 1)
     return RadioWindow(jnp.where(complete, relative, 0.0), jnp.where(complete, jnp.zeros_like(relative), jnp.inf))
 
 
@@ -197,7 +213,7 @@ def radio_windows(
     reads: PhaseReads,
     frame_time_s: Float[Array, " time"],
     num_window: int,
-    estimator: Literal["robust", "paper"] = "robust",
+    estimator: Literal["robust", "published", "published_causal", "literal"] = "robust",
     model: RadioModel | None = None,
 ) -> RadioWindow:
     """Ranges over the last `num_window` frames, (time, window), metres relative to each window's first frame.
@@ -205,12 +221,17 @@ def radio_windows(
     Their standard deviations are infinite where the range is unknown. `model` None takes `radio_model(reads)`. Raises
     `ValueError` for an unknown estimator.
     """
-    if estimator == "paper":
-        return _paper_jit(reads, frame_time_s, num_window)
+    if estimator in _OF_THE_PAPER:
+        return _OF_THE_PAPER[estimator](reads, frame_time_s, num_window)
     if estimator != "robust":
-        raise ValueError(f"Unknown radio estimator {estimator!r}; expected 'robust' or 'paper'.")
+        known = ", ".join(("robust", *_OF_THE_PAPER))
+        raise ValueError(f"Unknown radio estimator {estimator!r}; expected one of {known}.")
     return _robust_jit(reads, frame_time_s, num_window, radio_model(reads) if model is None else model)
 
 
-_paper_jit = jax.jit(paper_windows, static_argnums=2)
+_OF_THE_PAPER = {
+    "published": jax.jit(published_windows, static_argnums=2),
+    "published_causal": jax.jit(functools.partial(published_windows, causal=True), static_argnums=2),
+    "literal": jax.jit(literal_windows, static_argnums=2),
+}
 _robust_jit = jax.jit(robust_windows, static_argnums=2)

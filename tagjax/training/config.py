@@ -23,9 +23,6 @@ class TrainConfig:
     optimizer: Mapping[str, Any]
     weights: str | None = None  # initial learned parameters: `default`, a name, or a file (tagjax.tagattention.learned)
     baselines: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # evaluated beside the tracer
-    baseline_estimators: Mapping[str, str] = dataclasses.field(
-        default_factory=dict
-    )  # of a baseline, where it differs from the clips' estimator
     seed: int = 0
     clip_norm: float = 1.0
     resume: bool = True  # from the run folder's newest checkpoint, if there is one

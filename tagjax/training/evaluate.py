@@ -10,7 +10,7 @@ from typing import Any
 import jax
 from rich.progress import track
 
-from ..core.settings import ConfigError
+from ..core.settings import ConfigError, changed
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
 from ..report.report import write_report
@@ -51,8 +51,7 @@ def evaluate_tracers(
     folder: Path,
     *,
     clips: ClipSettings,
-    estimators: Mapping[str, str] | None = None,
-    flows: Mapping[str, str] | None = None,
+    own_clips: Mapping[str, Mapping[str, Any]] | None = None,
     settings: ScoreSettings,
     epcs: Sequence[str] | None = None,
     frames: tuple[int, int] | None = None,
@@ -60,23 +59,14 @@ def evaluate_tracers(
 ) -> dict[str, Any]:
     """Run each tracer over each recording, write the report into `folder` and return its summary.
 
-    `estimators` and `flows` hold the radio estimator and the flow of tracers that do not use those of `clips`. A tracer that
-    supports one antenna uses the one with the most reads where `clips` has several. With `settings.smooth` the tracers
+    `own_clips` holds by tracer the clip settings that differ from `clips`. A tracer that supports one antenna uses the one with the most reads where `clips` has several. With `settings.smooth` the tracers
     that support it are smoothed offline and get the suffix `_smoothed` in the report; the others run online. Raises
     `ConfigError` where no tracer supports it.
     """
-    estimators, flows = estimators or {}, flows or {}
-    loaders = {
-        name: clip_loader(
-            dataclasses.replace(
-                clips,
-                estimator=estimators.get(name, clips.estimator),
-                flow=flows.get(name, clips.flow),
-                antennas=antennas_for(tracer, clips.antennas),
-            )
-        )
-        for name, tracer in tracers.items()
-    }
+    chosen: dict[str, ClipSettings] = {}
+    for name, tracer in tracers.items():
+        common = dataclasses.replace(clips, antennas=antennas_for(tracer, clips.antennas))
+        chosen[name] = changed(common, (own_clips or {}).get(name, {}), where=f"clips of {name}")
     smoothed = smoothing_tracers(tracers, settings)
     labels = {name: f"{name}_smoothed" if name in smoothed else name for name in tracers}
     work = [(name, number) for name in tracers for number in range(len(recordings))]
@@ -86,8 +76,8 @@ def evaluate_tracers(
             evaluate_recording(
                 tracers[name],
                 recordings[number],
-                loaders[name],
-                stride=clips.stride,
+                clip_loader(chosen[name]),
+                stride=chosen[name].stride,
                 epcs=epcs,
                 settings=settings.supported_by(tracers[name]),
                 frames=frames,

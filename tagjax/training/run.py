@@ -20,7 +20,7 @@ from ..recording import Recording
 from ..report.report import score_table
 from ..tagattention import TagAttention
 from ..tagattention.learned import save_parameters
-from ..tagattention.tracer_settings import make_tracer
+from ..tagattention.tracer_settings import baseline_clips, make_tracer
 from ..tracing.clips import Clip, clip_loader
 from ..tracing.tracer import AbstractTracer
 from .checkpoint import Checkpoints
@@ -226,8 +226,7 @@ def _report(
         validation,
         folder / "report",
         clips=config.data.clips,
-        estimators=config.baseline_estimators,
-        flows=flows,
+        own_clips=baseline_clips(config.baselines) | {name: {"flow": flow} for name, flow in flows.items()},
         settings=config.scores,
         epcs=config.data.clips.epcs,
         progress=config.loop.progress,

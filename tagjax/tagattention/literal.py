@@ -26,7 +26,7 @@ SIGNIFICANCE = 1e-3
 _HARD = 1e-6
 
 
-class PaperState(eqx.Module):
+class LiteralState(eqx.Module):
     """Motion map, frame times of the window, and the refined log-likelihood maps."""
 
     motion: MotionMap
@@ -34,7 +34,7 @@ class PaperState(eqx.Module):
     log_likelihood: Float[Array, "tag height width"]
 
 
-class TagAttentionPaper(AbstractTracer):
+class TagAttentionLiteral(AbstractTracer):
     """Eqs. 3-7 with the paper's constants. `softness` > 0 relaxes every hard step; 0 is the paper."""
 
     one_antenna = True
@@ -57,18 +57,18 @@ class TagAttentionPaper(AbstractTracer):
                 raise ValueError(f"{name} is {told[name]:g}; expected at least 0.")
         check_positive_integers(cell=self.cell)
 
-    def init(self, camera: Camera, frame: Frame) -> PaperState:
+    def init(self, camera: Camera, frame: Frame) -> LiteralState:
         height, width = frame.depth_m.shape
         num_tags, num_antennas, num_window = frame.radio.relative_m.shape
         if num_antennas != 1:
             raise ValueError(f"The paper's tracer knows one antenna; the clip has {num_antennas}. Set antennas to one.")
-        return PaperState(
+        return LiteralState(
             motion=empty_motion(height, width, num_window),
             time_s=jnp.broadcast_to(frame.time_s, (num_window,)),
             log_likelihood=jnp.zeros((num_tags, height, width)),
         )
 
-    def step(self, camera: Camera, state: PaperState, frame: Frame) -> tuple[PaperState, Trace]:
+    def step(self, camera: Camera, state: LiteralState, frame: Frame) -> tuple[LiteralState, Trace]:
         points = camera.rays * frame.depth_m[..., None]
         valid = frame.depth_m > 0
         distance = jnp.where(valid, camera.ranges_m(points)[0], 0.0)
@@ -105,7 +105,7 @@ class TagAttentionPaper(AbstractTracer):
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
         confidence = jnp.where(jnp.sum(mask, axis=(1, 2)) > 0, 1.0, 0.0)
         trace = describe(mask, centre, step_m[None], recent, confidence, 0.0)
-        return PaperState(motion, time_s, likelihood), trace
+        return LiteralState(motion, time_s, likelihood), trace
 
-    def finish(self, state: PaperState) -> PaperState:
+    def finish(self, state: LiteralState) -> LiteralState:
         return state

@@ -1,0 +1,158 @@
+"""TagAttention as published (Shi et al., 2021, III.D-G): Eqs. 3-7 on pixels that move along the flow, and a refined mask.
+
+What the text leaves open is read so that small objects survive (docs/published-tracer.md): every pixel of a frame is
+moved, not averaged; K-means refines the mask, and the likelihood is kept; the cut lies in the flat part of the CDF; what
+is propagated is bounded below.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float
+
+from ...core.parameters import check_fractions, check_positive, check_positive_integers
+from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
+from ..attention import att_corr, att_rbf, attention
+from ..frame_trace import describe
+from ..propagation import radio_speed
+from .clusters import assign, k_means, refined, seed_centres
+from .transport import filled, moved, nearest_source
+
+_ROWS, _ITERATIONS, _EVERY = 6, 3, 2
+
+
+class PublishedState(eqx.Module):
+    """What is carried from frame to frame; at pixels of the last frame."""
+
+    range_m: Float[Array, "height width"]  # 0 = missing
+    history_m: Float[Array, "height width past"]  # of the surface at each pixel, oldest first, before the last frame's
+    known: Bool[Array, "height width past"]
+    time_s: Float[Array, " window"]
+    log_likelihood: Float[Array, "tag height width"]
+    centres_m: Float[Array, "cluster 3"]
+    num_frames: Float[Array, ""]
+
+
+def _scalar(value: float | Array) -> Float[Array, ""]:
+    return jnp.asarray(value, jnp.float32)
+
+
+class TagAttentionPublished(AbstractTracer):
+    """Eqs. 3-7 with the paper's constants; those that the paper does not give were chosen on training recordings."""
+
+    one_antenna = True
+
+    alpha_m2: Float[Array, ""] = eqx.field(converter=_scalar, default=5e-4)
+    beta: Float[Array, ""] = eqx.field(converter=_scalar, default=0.8)
+    v0_m_s: Float[Array, ""] = eqx.field(converter=_scalar, default=0.1)
+    floor: Float[Array, ""] = eqx.field(converter=_scalar, default=0.01)  # attentions below count as this
+    cut: Float[Array, ""] = eqx.field(converter=_scalar, default=0.1)  # of the normalised likelihood
+    lowest: Float[Array, ""] = eqx.field(converter=_scalar, default=1e-3)  # a normalised likelihood is at least this
+    whole: Float[Array, ""] = eqx.field(converter=_scalar, default=0.3)  # a cluster covered so far is taken whole
+    part: Float[Array, ""] = eqx.field(converter=_scalar, default=0.05)  # one covered less than this is left out
+    max_step_m: Float[Array, ""] = eqx.field(converter=_scalar, default=0.05)  # of a surface between two frames
+    num_clusters: int = eqx.field(static=True, default=48)
+
+    def __check_init__(self) -> None:
+        given = {name: leaf for name, leaf in vars(self).items() if not isinstance(leaf, Tracer)}
+        positive = given.keys() & {"alpha_m2", "floor", "lowest", "max_step_m"}
+        check_positive(**{name: round(float(given[name]), 9) for name in positive})
+        fractions = given.keys() & {"beta", "cut", "whole", "part"}
+        check_fractions(**{name: round(float(given[name]), 6) for name in fractions})
+        if "v0_m_s" in given and not given["v0_m_s"] >= 0:
+            raise ValueError(f"v0_m_s is {given['v0_m_s']:g}; expected at least 0.")
+        check_positive_integers(num_clusters=self.num_clusters)
+        if self.num_clusters % _ROWS:
+            raise ValueError(f"num_clusters is {self.num_clusters}; expected a multiple of {_ROWS}, the rows of seeds.")
+
+    def init(self, camera: Camera, frame: Frame) -> PublishedState:
+        height, width = frame.depth_m.shape
+        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
+        if num_antennas != 1:
+            raise ValueError(
+                f"The published tracer measures ranges to one antenna; the clip has {num_antennas}. Set clips.antennas to one."
+            )
+        return PublishedState(
+            range_m=jnp.zeros((height, width)),
+            history_m=jnp.zeros((height, width, num_window - 1)),
+            known=jnp.zeros((height, width, num_window - 1), bool),
+            time_s=jnp.broadcast_to(frame.time_s, (num_window,)),
+            log_likelihood=jnp.zeros((num_tags, height, width)),
+            centres_m=jnp.zeros((self.num_clusters, 3)),
+            num_frames=jnp.zeros(()),
+        )
+
+    def step(self, camera: Camera, state: PublishedState, frame: Frame) -> tuple[PublishedState, Trace]:
+        points = camera.rays * frame.depth_m[..., None]
+        valid = frame.depth_m > 0
+        range_m = jnp.where(valid, camera.ranges_m(points)[0], 0.0)
+        time_s = jnp.concatenate([state.time_s[1:], frame.time_s[None]])
+
+        # Eq. 3: each pixel of the last frame moves along the flow with its history and its likelihoods.
+        source = nearest_source(frame.forward_px, state.range_m)
+        source = filled(source, state.range_m, range_m, self.max_step_m)
+        before = jnp.concatenate([state.history_m[..., 1:], state.range_m[..., None]], axis=-1)
+        was_known = jnp.concatenate([state.known[..., 1:], (state.range_m > 0)[..., None]], axis=-1)
+        history, reached = moved(before, source, jnp.zeros(before.shape[-1]))
+        known_before, _ = moved(was_known.astype(before.dtype), source, jnp.zeros(before.shape[-1]))
+        known = (known_before > 0.5) & reached[..., None]
+        window = jnp.concatenate([history, range_m[..., None]], axis=-1)
+        complete = jnp.all(known, axis=-1) & valid
+        rho = jnp.where(complete[..., None], window - window[..., :1], 0.0)
+        least = jnp.min(state.log_likelihood, axis=(1, 2))
+        carried, _ = moved(jnp.moveaxis(state.log_likelihood, 0, -1), source, least)
+
+        flat, known_flat = points.reshape(-1, 3), valid.reshape(-1)
+        seeds = seed_centres(points, valid, _ROWS, self.num_clusters // _ROWS)
+        centres = jnp.where(state.num_frames > 0, state.centres_m, seeds)
+        centres = k_means(flat[::_EVERY], known_flat[::_EVERY], centres, num_iterations=_ITERATIONS)
+        cluster = assign(flat, centres)
+
+        def one_tag(
+            log_likelihood: Float[Array, "height width"],
+            relative_m: Float[Array, " window"],
+            std_m: Float[Array, " window"],
+        ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
+            rd = relative_m - relative_m[0]
+            every = jnp.ones(rho.shape, bool)
+            radial = att_rbf(rho, rd[None, None], every, self.alpha_m2[None, None])
+            agreement = attention(radial, att_corr(rho, rd[None, None], every), self.beta)
+            agreement = jnp.maximum(jnp.where(complete, agreement, 0.0), self.floor)
+            moves = jnp.all(jnp.isfinite(std_m)) & (radio_speed(rd, time_s) >= self.v0_m_s)
+            log_likelihood = log_likelihood + jnp.where(moves, jnp.log(agreement), 0.0)
+            return self._masked(log_likelihood, valid, cluster)
+
+        likelihood, mask = jax.vmap(one_tag)(
+            jnp.moveaxis(carried, -1, 0), frame.radio.relative_m[:, 0], frame.radio.std_m[:, 0]
+        )
+        number = jnp.sum(mask, axis=(1, 2))
+        centre = jnp.einsum("thw,hwc->tc", mask, points) / jnp.maximum(number, 1.0)[:, None]
+        step_m = jnp.where(known[..., -1] & valid, range_m - history[..., -1], 0.0)
+        trace = describe(mask, centre, step_m[None], known[..., -1] & valid, jnp.where(number > 0, 1.0, 0.0), 0.0)
+        after = PublishedState(range_m, history, known, time_s, likelihood, centres, state.num_frames + 1)
+        return after, trace
+
+    def _masked(
+        self, log_likelihood: Float[Array, "height width"], valid: Bool[Array, "height width"], cluster: Array
+    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
+        """The refined likelihood, which is propagated, and the refined mask; where nothing stands out, no mask."""
+        top = jnp.max(jnp.where(valid, log_likelihood, -jnp.inf))
+        odds = jnp.where(valid, jnp.exp(log_likelihood - jnp.where(jnp.isfinite(top), top, 0.0)), 0.0)
+        least = jnp.min(jnp.where(valid, odds, jnp.inf))
+        spread = jnp.where(jnp.isfinite(least), 1.0 - least, 0.0)
+        normal = jnp.where(valid & (spread > 0), (odds - least) / jnp.where(spread > 0, spread, 1.0), 0.0)
+        cut = valid & (normal >= self.cut) & (spread > 0)
+        shape = valid.shape
+        mask = refined(
+            cut.reshape(-1), cluster, valid.reshape(-1), self.num_clusters, whole=self.whole, part=self.part
+        ).reshape(shape)
+        count = jnp.sum(mask.astype(normal.dtype))
+        mean = jnp.sum(jnp.where(mask, normal, 0.0)) / jnp.maximum(count, 1.0)
+        raised = jnp.where(mask, jnp.maximum(normal, mean), normal)
+        return jnp.log(jnp.maximum(raised, self.lowest)), mask.astype(log_likelihood.dtype)
+
+    def finish(self, state: PublishedState) -> PublishedState:
+        return state
