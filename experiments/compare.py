@@ -1,7 +1,7 @@
 """All systems on the same suites, in one table; the last line is the result as JSON.
 
 python -m experiments.compare 'suites=[planar_tracks,ceiling_2]' max_recordings=2
-python -m experiments.compare 'suites=[single_static]' 'only=[tagattention,tagattention_paper]'
+python -m experiments.compare 'suites=[single_static]' 'only=[tagattention,tagattention_published]'
 python -m experiments.compare 'suites=[shop_exit]' systems.goller_calibration=<calibration.json of experiments.goller>
 python -m experiments.compare 'suites=[shop_exit]' systems.goller_grid=<recording of shop_grid>  # with unfitted widths
 """

@@ -200,7 +200,7 @@ def test_what_cannot_be_compared_is_refused():
 @pytest.mark.ci
 def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     config = _config(
-        ["planar_tracks"], smoke=True, max_recordings=1, recordings_dir=str(tmp_path / "made"), only=("tagattention_paper", "tagvision", "goller")
+        ["planar_tracks"], smoke=True, max_recordings=1, recordings_dir=str(tmp_path / "made"), only=("tagattention_published", "tagvision", "goller")
     )  # fmt: skip
     config = dataclasses.replace(config, scores=dataclasses.replace(config.scores, min_pixels=2))
     reported: list[str] = []
@@ -215,7 +215,7 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
         assert cell.p_fa is None  # everything moves
         assert (cell.ms_a_frame or 0) > 0
     written = json.loads((tmp_path / "out" / "table.json").read_text())
-    assert [one["system"] for one in written] == ["tagattention_paper", "tagvision", "goller"]
+    assert [one["system"] for one in written] == ["tagattention_published", "tagvision", "goller"]
     assert [one["paper"] for one in written] == [None, config.published["planar_tracks"]["tagvision"], None]
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()

@@ -1,7 +1,7 @@
 """Tracers that run on the host: OpenCV detects and tracks, so there is no `lax.scan`, but the interface is the same.
 
 `AbstractHostTracer` is a state machine as `AbstractTracer` is: `init`, one `step` a frame, `finish`. Its input is
-colour pictures instead of flow and depth (no baseline has a depth camera) and raw reads instead of distances; its
+colour pictures (and depth, where a tracer asks for it) instead of flow, and raw reads instead of distances; its
 output is a `Trace` at the full size of the picture. `host_trace` yields the same pairs as the tracing of
 `AbstractTracer`, so the same code scores both. Everything is causal: at a frame only the reads up to that frame are
 used.
@@ -12,13 +12,14 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
+from ..core.geometry import range_to_depth
 from ..recording import Intrinsics, Recording, RecordingError, TagReads
 from ..tracing.tracer import Trace
 
@@ -41,6 +42,7 @@ class HostFrame:
     colour: UInt8[np.ndarray, "height width 3"]
     reads: TagReads  # of all traced tags, in order of time
     read_time_s: Float[np.ndarray, " reads"]  # of those reads, since the recording's first frame
+    depth_m: Float[np.ndarray, "height width"] | None = None  # z, 0 = missing; for tracers that need depth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +58,9 @@ class Detection:
 
 class AbstractHostTracer(abc.ABC):
     """A tracing system on the host as a state machine: `init`, one `step` a frame, `finish`."""
+
+    needs_depth: ClassVar[bool] = False
+    """Whether frames hold depth. The systems before TagAttention have no depth camera."""
 
     @abc.abstractmethod
     def inapplicable(self, recording: Recording) -> str | None:
@@ -77,9 +82,9 @@ class AbstractHostTracer(abc.ABC):
 
 
 def host_frames(
-    recording: Recording, epcs: Sequence[str], frames: tuple[int, int] | None = None
+    recording: Recording, epcs: Sequence[str], frames: tuple[int, int] | None = None, *, depth: bool = False
 ) -> Iterator[HostFrame]:
-    """The frames `first` to `last` - 1 with their reads. The first frame gets every read since the recording's start.
+    """The frames `first` to `last` - 1 with their reads, and with their depth if asked for. The first frame gets every read since the recording's start.
 
     Raises `RecordingError` for frames outside the recording.
     """
@@ -103,7 +108,14 @@ def host_frames(
             colour=np.asarray(recording.colour[number]),
             reads=own[part],
             read_time_s=read_time_s[part],
+            depth_m=_depth_m(recording, number) if depth else None,
         )
+
+
+def _depth_m(recording: Recording, number: int) -> Float[np.ndarray, "height width"]:
+    """Depth along the optical axis at a frame, 0 where missing."""
+    depth_m = recording.depth_metres(number)
+    return range_to_depth(depth_m, recording.intrinsics) if recording.depth_kind == "range" else depth_m
 
 
 def host_trace(
@@ -130,7 +142,7 @@ def host_trace(
         raise RecordingError(f"{recording.name}: {type(tracer).__name__} does not apply: {reason}")
     camera = HostCamera(recording.intrinsics, np.asarray(recording.antennas_m, np.float64), traced)
     state = tracer.init(camera)
-    for frame in host_frames(recording, traced, frames):
+    for frame in host_frames(recording, traced, frames, depth=tracer.needs_depth):
         state, trace = tracer.step(camera, state, frame)
         yield frame.number, jax.tree.map(np.asarray, trace)
 

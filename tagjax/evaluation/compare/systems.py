@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...baselines import host_trace
+from ...baselines.blobs import BlobSettings, BlobTracer
 from ...baselines.goller import Calibration, GollerSettings, GollerTracer, load_calibration
 from ...baselines.goller.calibration import calibrate
 from ...baselines.tagview import TagviewSettings, TagviewTracer
@@ -26,14 +27,11 @@ from ...tracing.tracer import AbstractTracer, Trace
 
 Traces = Iterator[tuple[int, Trace]]
 
-NAMES = ("tagattention", "tagattention_paper", "tagvision", "tagview", "goller")
-"""TagAttention as it is learned here, TagAttention as its paper describes it, and the three systems before it."""
+NAMES = ("tagattention", "tagattention_published", "blobs", "tagvision", "tagview", "goller")
+"""TagAttention as it is learned here and as published, moving blobs without pixel fusion, and the three systems before it."""
 
 TABLE = "tabletop"
 """The story of objects that move on a table below the camera."""
-
-DEVICE = NAMES[:2]
-"""The systems that run compiled, on clips."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +40,8 @@ class SystemSettings:
 
     tagattention: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # as under conf/tracer
     settings_of: Mapping[str, str] = dataclasses.field(default_factory=dict)  # name in `tagattention`, by story
-    tagattention_paper: Mapping[str, Any] = dataclasses.field(
-        default_factory=dict
-    )  # on the same clips as `tagattention`
+    tagattention_published: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    blobs: BlobSettings = dataclasses.field(default_factory=BlobSettings)
     tagvision: TagVisionSettings = dataclasses.field(default_factory=TagVisionSettings)
     tagvision_calibration: CalibrationSettings = dataclasses.field(default_factory=CalibrationSettings)
     tagview: TagviewSettings = dataclasses.field(default_factory=TagviewSettings)
@@ -80,7 +77,7 @@ class Systems:
 
         Raises `ConfigError` for a story that is not in `settings_of`.
         """
-        if name not in DEVICE:
+        if name != "tagattention":
             return None
         story = item.variant.story or item.suite.story
         if story not in self.settings.settings_of:
@@ -98,15 +95,16 @@ class Systems:
 
     def stride(self, name: str, item: Item) -> int:
         """The stride in pixels of a system's masks."""
-        settings_name = self.settings_name(name, item)
-        return 1 if settings_name is None else tracer_clips(self.settings.tagattention[settings_name]).stride
+        settings = self._device_settings(name, item)
+        return 1 if settings is None else tracer_clips(settings).stride
 
     def traces(self, name: str, item: Item, recording: Recording, epcs: list[str]) -> Traces:
         """Frame numbers and traces. Raises `RecordingError` or `ValueError` where the method cannot apply."""
-        settings_name = self.settings_name(name, item)
-        if settings_name is not None:
-            return self._device(name, settings_name, recording, epcs)
+        settings = self._device_settings(name, item)
+        if settings is not None:
+            return self._device((name, self.settings_name(name, item)), settings, recording, epcs)
         make: dict[str, Callable[[], Any]] = {
+            "blobs": lambda: BlobTracer(self.settings.blobs),
             "tagvision": lambda: self._tagvision(item, recording),
             "tagview": lambda: self._tagview(item, recording),
             "goller": lambda: self._goller(recording),
@@ -119,14 +117,19 @@ class Systems:
             raise RecordingError(reason)
         return host_trace(tracer, recording, epcs=epcs)
 
-    def _device(self, name: str, settings_name: str, recording: Recording, epcs: list[str]) -> Traces:
-        settings, paper = self.settings.tagattention[settings_name], name == "tagattention_paper"
-        clips = tracer_clips(settings)
-        clips = dataclasses.replace(clips, estimator="paper") if paper else clips
-        key = name, None if paper else settings_name
+    def _device_settings(self, name: str, item: Item) -> Mapping[str, Any] | None:
+        """The tracer's settings of a system that runs compiled, on clips; None for the others."""
+        if name == "tagattention_published":
+            return self.settings.tagattention_published
+        settings_name = self.settings_name(name, item)
+        return None if settings_name is None else self.settings.tagattention[settings_name]
+
+    def _device(
+        self, key: tuple[str, str | None], settings: Mapping[str, Any], recording: Recording, epcs: list[str]
+    ) -> Traces:
         if key not in self._tracers:
-            self._tracers[key] = make_tracer(self.settings.tagattention_paper if paper else settings)
-        tracer = self._tracers[key]
+            self._tracers[key] = make_tracer(settings)
+        tracer, clips = self._tracers[key], tracer_clips(settings)
         return trace_recording(
             tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.supported_by(tracer)
         )
