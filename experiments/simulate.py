@@ -4,6 +4,7 @@ python -m experiments.simulate suite=multi_4
 python -m experiments.simulate suite=corpus suite.counts.train=200 paths.recordings_dir=recordings/corpus workers=8
 python -m experiments.simulate suite=crowd smoke=true paths.recordings_dir=recordings/smoke
 python -m experiments.simulate -m 'suite=glob(*)' sheet=docs/benchmark   # the pictures of docs/benchmark.md
+python -m experiments.simulate suite=multi_4 budget=train   # how strongly each tag is read, and why
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from tagjax.core.settings import from_mapping
     from tagjax.sim.contact_sheet import save_preview, save_sheet
+    from tagjax.sim.link_budgets import budget_lines
     from tagjax.sim.suites import SimulateConfig, Suite, make_suite
 
     from .progress import counting_bar
@@ -34,6 +36,9 @@ def main(values: dict[str, Any], folder: Path) -> None:
     recordings_dir, console = Path(config.recordings_dir), Console(markup=False)
     if config.sheet is not None:
         console.print(f"{suite.name}: {save_preview(suite, Path(config.sheet), workers=config.workers or 1)}")
+        return
+    if config.budget is not None:
+        console.print("\n".join(budget_lines(suite, config.budget)), soft_wrap=True, highlight=False)
         return
     items = suite.items()
     with counting_bar(console, shown=config.progress) as bar:

@@ -12,9 +12,11 @@ LAYERS = {
     "rendering": 1,
     "radio": 1,
     "stories": 2,
-    "record": 3,
-    "suites": 4,
-    "contact_sheet": 5,
+    "propagation": 3,
+    "record": 4,
+    "suites": 5,
+    "contact_sheet": 6,
+    "link_budgets": 6,
 }
 """Layer of each part of the simulator. Two parts of one layer do not import each other."""
 

@@ -12,21 +12,15 @@ import numpy as np
 
 from ..recording import ClockAudit, Intrinsics, Recording, RecordingError, TagReads, Truth
 from ..recording.importers.clock import to_host_clock
-from ..recording.virtual_tags import Track
-from .radio.environment import room_environment
+from .propagation import propagation
 from .radio.inventory import simulate_inventory
 from .rendering.exact_flow import flow_between
 from .rendering.exposure import ILLUMINATION, auto_exposure
 from .rendering.hits import Hits
 from .rendering.sensors import SENSORS, frame_times, kinect_v2_intrinsics, xtion_intrinsics
 from .rendering.viewpoint import Viewpoint, look_at
-from .rendering.visibility import sampled_steps
 from .stories.scenario import Scenario
-from .world.bodies import STEP_S, World, tag_dipole, tag_path
-from .world.sightline import line_of_sight
-
-_SIGHT_PERIOD_S = 0.05
-"""Sampling period of lines of sight and of people's positions for the radio; a walker moves by 7 cm in it."""
+from .world.bodies import STEP_S, World, tag_path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,40 +182,21 @@ def _read_tags(scenario: Scenario, seed: int) -> tuple[TagReads, ClockAudit | No
 
     The ratio is (num_steps,): 1 for a free line of sight, 0 behind metal.
     """
-    world = scenario.world
-    if not world.tags:
+    if not scenario.world.tags:
         return TagReads.empty(), None, {}
-    antennas = np.asarray(scenario.antennas_m, float)
-    time_s = np.arange(world.num_steps) * STEP_S
-    sampled = sampled_steps(world, _SIGHT_PERIOD_S)
-    paths, transmission, dipole = {}, {}, {}
-    for tag in world.tags:
-        path = tag_path(world, tag)
-        kept = []
-        for antenna in antennas:
-            start = np.broadcast_to(antenna, (len(sampled), 3))
-            sight = line_of_sight(world, start, path[sampled], sampled, exclude=(tag.body,))
-            kept.append(np.interp(np.arange(world.num_steps), sampled, 10.0 ** (-sight.loss_db / 20)))
-        paths[tag.epc] = Track(time_s, path)
-        transmission[tag.epc] = np.stack(kept, axis=-1)
-        dipole[tag.epc] = tag_dipole(world, tag)
-    people = _people(world)
-    scatterer_path = (time_s[sampled], np.stack([path[sampled] for path in people], axis=1)) if people else None
-    boresight = np.asarray(scenario.camera_look_at_m, float) - antennas
-    if scenario.antenna_axes is not None:
-        boresight = np.asarray(scenario.antenna_axes, float)
+    around = propagation(scenario)
     inventory = simulate_inventory(
-        paths,
-        antennas,
-        room_environment(scenario.panels, len(people)),
+        around.paths,
+        around.antennas_m,
+        around.environment,
         scenario.inventory,
         seed=seed,
-        transmission=transmission,
-        dipole=dipole,
-        boresight=boresight / np.linalg.norm(boresight, axis=1, keepdims=True),
-        scatterer_path=scatterer_path,
+        transmission=around.transmission,
+        dipole=around.dipole,
+        boresight=around.boresight,
+        scatterer_path=around.scatterer_path,
     )
-    sight = {epc: ratio[:, 0] for epc, ratio in transmission.items()}
+    sight = {epc: ratio[:, 0] for epc, ratio in around.transmission.items()}
     reads = inventory.reads
     if reads.reader_time_ns is None or reads.num_reads < 2:
         return reads, None, sight
@@ -232,13 +207,3 @@ def _read_tags(scenario: Scenario, seed: int) -> tuple[TagReads, ClockAudit | No
         return dataclasses.replace(reads, arrival_time_ns=reads.time_ns), None, sight
     reads = dataclasses.replace(reads, time_ns=converted.time_ns, arrival_time_ns=reads.time_ns)
     return reads[converted.usable], converted.audit, sight
-
-
-def _people(world: World) -> list[np.ndarray]:
-    """The centre of every person at every step, (num_steps, 3): the mean over the limbs."""
-    limbs: dict[str, list[np.ndarray]] = {}
-    for body in world.bodies:
-        if body.role == "person":
-            path = body.poses.position_m
-            limbs.setdefault(body.name, []).append(np.broadcast_to(path, (world.num_steps, 3)))
-    return [np.mean(parts, axis=0) for parts in limbs.values()]

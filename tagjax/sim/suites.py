@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from filelock import FileLock
@@ -331,6 +331,7 @@ class SimulateConfig:
     workers: int | None = None  # processes; as many as there are cores if None
     progress: bool = True
     sheet: str | None = None  # a folder for a contact sheet; no recordings are then made
+    budget: Literal["train", "validation", "test"] | None = None  # a split; its link budgets are then printed instead
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:

@@ -92,7 +92,7 @@ class SetUp:
         if self.scatterer_path is not None:
             around = interpolate(time_s, *self.scatterer_path)
         carrier, place = self.state.hop_table_hz[channel], self.antennas_m[antenna]
-        phase, rssi = _padded_gains(
+        phase, rssi = padded_gains(
             self.environment, position, place, carrier, passed, axis[known], self.boresight[antenna], around
         )
         return Links(time_s, tag, antenna, channel, position, passed, phase, rssi + self.rssi_at_1m_dbm)
@@ -128,7 +128,7 @@ def interpolate(when, time_s, values) -> np.ndarray:
     return out.reshape(len(when), *values.shape[1:])
 
 
-def _padded_gains(environment, *columns) -> tuple[np.ndarray, np.ndarray]:
+def padded_gains(environment, *columns) -> tuple[np.ndarray, np.ndarray]:
     """`link_gains` of any number of reads, padded to a power of two so that few sizes are compiled."""
     count = len(columns[0])
     if count == 0:
