@@ -8,6 +8,7 @@ import numpy as np
 
 from ..world.bodies import STEP_S, Body, Material, Poses, Shape, rotation_matrix
 from ..world.figure import PersonModel
+from ..world.mounting import mounted
 from ..world.objects import ObjectModel, make_object
 from ..world.people import Hands, carried_poses, hand_target, make_person, move_person
 from ..world.rooms import make_room
@@ -45,12 +46,14 @@ def handheld(
     num_static_tags: int = 0,
     num_antennas: int = 1,
     distance_m: Sequence[float] = (1.7, 2.3),
+    mounting: str = "as_drawn",
 ) -> Scenario:
     """People in front of the camera wave an object in each hand, after `stationary_s` without motion.
 
     `stationary_s` is limited to two fifths of the duration. Objects of the kinds in `lookalikes` look identical;
     `one_grip` puts all objects into one hand, side by side; with `notebook_occluder` a notebook in the other hand moves
-    in front of the (only) object; `num_walkers` people walk behind; `num_static_tags` tagged objects lie in the room.
+    in front of the (only) object; `num_walkers` people walk behind; `num_static_tags` tagged objects lie in the room;
+    `mounting` of the objects' tags as in `mounted`.
     """
     if notebook_occluder and len(kinds) != 1:
         raise ValueError(
@@ -58,7 +61,7 @@ def handheld(
         )
     builder = ScenarioBuilder(make_room(room, rng), duration_s)
     looks = {kind: int(rng.integers(2**31)) for kind in lookalikes}
-    models = [make_object(kind, rng, look=looks.get(kind)) for kind in kinds]
+    models = [mounted(make_object(kind, rng, look=looks.get(kind)), mounting) for kind in kinds]
     count = 1 if one_grip else -(-len(models) // 2)
     places = standing_places(builder.room, rng, count, (distance_m[0], distance_m[1]))
     camera = builder.room.camera_position_m
