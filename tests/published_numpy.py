@@ -90,7 +90,12 @@ def masked(
     normal = np.where(valid, (odds - least) / (1 - least), 0.0)
     mask = refined((valid & (normal >= cut)).reshape(-1), cluster, valid.reshape(-1), whole, part).reshape(valid.shape)
     if mask.any():
-        normal = np.where(mask, np.maximum(normal, normal[mask].mean()), normal)
+        raised = normal.copy()
+        for number in np.unique(cluster):
+            own = mask & (cluster == number).reshape(mask.shape)
+            if own.any():
+                raised[own] = np.maximum(normal[own], normal[own].mean())
+        normal = raised
     return np.log(np.maximum(normal, lowest)), mask
 
 

@@ -84,7 +84,7 @@ def test_clusters_are_those_of_lloyds_algorithm(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.normal(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32) + np.array([0, 0, 4], np.float32)
     valid = rng.random((HEIGHT, WIDTH)) < 0.8
-    centres = np.array(seed_centres(jnp.asarray(points), jnp.asarray(valid), 3, 4))
+    centres = np.array(seed_centres(jnp.asarray(points), jnp.asarray(valid), 12))
     assert centres.shape == (12, 3)
     flat, known = points.reshape(-1, 3), valid.reshape(-1)
     centres[0] = 50.0  # far from everything: stays
@@ -111,7 +111,7 @@ def test_the_mask_and_the_refined_likelihood_are_those_of_the_twin(seed: int) ->
     likelihood = (likelihood + rng.normal(0, 1, likelihood.shape)).astype(np.float32)
     tracer = TagAttentionPublished()
     carried, mask = tracer._masked(jnp.asarray(likelihood), jnp.asarray(valid), jnp.asarray(cluster))
-    want, want_mask = plain.masked(likelihood, valid, cluster, cut=0.1, lowest=1e-3, whole=0.3, part=0.05)
+    want, want_mask = plain.masked(likelihood, valid, cluster, cut=0.1, lowest=1e-3, whole=0.3, part=0.1)
     np.testing.assert_array_equal(np.asarray(mask) > 0.5, want_mask)
     assert want_mask.any()
     np.testing.assert_allclose(carried, want, atol=1e-4)
@@ -232,14 +232,14 @@ def test_nothing_after_a_frame_is_used_by_the_causal_estimator() -> None:
 
 def test_a_moving_box_is_found() -> None:
     clip = synthetic.load(synthetic.recording(40), 0, 40)
-    tracer = TagAttentionPublished(num_clusters=12)
+    tracer = TagAttentionPublished(num_clusters=24)
     out = trace(tracer, clip.camera, clip.frames)
     labels = np.asarray(synthetic.recording(40).truth.labels)  # pyright: ignore[reportOptionalMemberAccess]
     overlaps = []
     for tag, label in ((0, 1), (1, 2)):
         mask, true = np.asarray(out.mask)[20:, tag] > 0.5, labels[20:40] == label
         overlaps.append(np.sum(mask & true) / np.sum(mask | true))
-    assert min(overlaps) > 0.6
+    assert min(overlaps) > 0.9
 
 
 def test_jit_is_eager_and_gradients_are_finite() -> None:
@@ -268,7 +268,7 @@ def test_jit_is_eager_and_gradients_are_finite() -> None:
         ({"alpha_m2": 0.0}, "alpha_m2"),
         ({"cut": 1.5}, "cut"),
         ({"v0_m_s": -1.0}, "v0_m_s"),
-        ({"num_clusters": 7}, "num_clusters"),
+        ({"num_clusters": 0}, "num_clusters"),
     ],
 )
 def test_wrong_constants_are_refused(wrong: dict[str, float], message: str) -> None:

@@ -1,21 +1,30 @@
-"""Few K-means clusters of position, and the mask refined by them (TagAttention, III.G, after Jaimez et al., 2017)."""
+"""K-means clusters of position, and the mask refined by them (TagAttention, III.G, after Jaimez et al., 2017)."""
 
 from __future__ import annotations
+
+import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
+def seed_grid(num_clusters: int) -> tuple[int, int]:
+    """Rows and columns, as equal as they can be, of a grid with so many cells."""
+    rows = max(side for side in range(1, math.isqrt(num_clusters) + 1) if num_clusters % side == 0)
+    return rows, num_clusters // rows
+
+
 def seed_centres(
-    points_m: Float[Array, "height width 3"], valid: Bool[Array, "height width"], rows: int, columns: int
+    points_m: Float[Array, "height width 3"], valid: Bool[Array, "height width"], num_clusters: int
 ) -> Float[Array, "cluster 3"]:
-    """Mean position of each of rows x columns cells of the picture; the mean of all where a cell has no valid pixel."""
+    """Mean position of each cell of a grid over the picture; the mean of all where a cell has no valid pixel."""
     height, width = valid.shape
+    rows, columns = seed_grid(num_clusters)
     row = jnp.arange(height) * rows // height
     column = jnp.arange(width) * columns // width
     cell = (row[:, None] * columns + column[None]).reshape(-1)
-    mean, count = _means(points_m.reshape(-1, 3), valid.reshape(-1), cell, rows * columns)
+    mean, count = means(points_m.reshape(-1, 3), valid.reshape(-1), cell, num_clusters)
     total = jnp.maximum(jnp.sum(count), 1.0)
     overall = jnp.sum(mean * count[:, None], axis=0) / total
     return jnp.where(count[:, None] > 0, mean, overall[None])
@@ -40,20 +49,24 @@ def k_means(
     """Centres after some iterations of Lloyd's algorithm; a cluster that loses all of its points keeps its centre."""
 
     def iterate(centres: Float[Array, "cluster 3"], _: None) -> tuple[Float[Array, "cluster 3"], None]:
-        mean, count = _means(points_m, valid, assign(points_m, centres), centres.shape[0])
+        mean, count = means(points_m, valid, assign(points_m, centres), centres.shape[0])
         return jnp.where(count[:, None] > 0, mean, centres), None
 
     out, _ = jax.lax.scan(iterate, centres_m, None, length=num_iterations)
     return out
 
 
-def _means(
-    points_m: Float[Array, "pixel 3"], valid: Bool[Array, " pixel"], cluster: Int[Array, " pixel"], num: int
-) -> tuple[Float[Array, "cluster 3"], Float[Array, " cluster"]]:
-    weight = valid.astype(points_m.dtype)
-    member = jax.nn.one_hot(cluster, num, dtype=points_m.dtype) * weight[:, None]
-    count = jnp.sum(member, axis=0)
-    return member.T @ points_m / jnp.maximum(count, 1.0)[:, None], count
+def means(
+    values: Float[Array, "pixel channel"],
+    valid: Bool[Array, " pixel"],
+    cluster: Int[Array, " pixel"],
+    num_clusters: int,
+) -> tuple[Float[Array, "cluster channel"], Float[Array, " cluster"]]:
+    """Each cluster's mean over its valid pixels, 0 where it has none; and their number."""
+    weight = valid.astype(values.dtype)
+    count = jax.ops.segment_sum(weight, cluster, num_clusters)
+    total = jax.ops.segment_sum(values * weight[:, None], cluster, num_clusters)
+    return total / jnp.maximum(count, 1.0)[:, None], count
 
 
 def refined(
@@ -66,8 +79,6 @@ def refined(
     part: Float[Array, ""],
 ) -> Bool[Array, " pixel"]:
     """A mask refined by clusters: all of a cluster of which it covers the fraction `whole`, its own pixels from `part` on."""
-    ones = valid.astype(jnp.float32)
-    size = jnp.zeros(num_clusters).at[cluster].add(ones)
-    covered = jnp.zeros(num_clusters).at[cluster].add(ones * mask.astype(ones.dtype))
-    fraction = (covered / jnp.maximum(size, 1.0))[cluster]
+    covered, _ = means(mask.astype(jnp.float32)[:, None], valid, cluster, num_clusters)
+    fraction = covered[cluster, 0]
     return valid & ((fraction >= whole) | (mask & (fraction >= part)))

@@ -18,10 +18,10 @@ from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
 from ..attention import att_corr, att_rbf, attention
 from ..frame_trace import describe
 from ..propagation import radio_speed
-from .clusters import assign, k_means, refined, seed_centres
+from .clusters import assign, k_means, means, refined, seed_centres
 from .transport import filled, moved, nearest_source
 
-_ROWS, _ITERATIONS, _EVERY = 6, 3, 2
+_ITERATIONS, _EVERY = 3, 2
 
 
 class PublishedState(eqx.Module):
@@ -41,20 +41,20 @@ def _scalar(value: float | Array) -> Float[Array, ""]:
 
 
 class TagAttentionPublished(AbstractTracer):
-    """Eqs. 3-7 with the paper's constants; those that the paper does not give were chosen on training recordings."""
+    """Eqs. 3-7 and the refinement. beta and v0 are the paper's; the other constants were chosen on training recordings."""
 
     one_antenna = True
 
-    alpha_m2: Float[Array, ""] = eqx.field(converter=_scalar, default=5e-4)
+    alpha_m2: Float[Array, ""] = eqx.field(converter=_scalar, default=1e-3)
     beta: Float[Array, ""] = eqx.field(converter=_scalar, default=0.8)
     v0_m_s: Float[Array, ""] = eqx.field(converter=_scalar, default=0.1)
     floor: Float[Array, ""] = eqx.field(converter=_scalar, default=0.01)  # attentions below count as this
     cut: Float[Array, ""] = eqx.field(converter=_scalar, default=0.1)  # of the normalised likelihood
     lowest: Float[Array, ""] = eqx.field(converter=_scalar, default=1e-3)  # a normalised likelihood is at least this
     whole: Float[Array, ""] = eqx.field(converter=_scalar, default=0.3)  # a cluster covered so far is taken whole
-    part: Float[Array, ""] = eqx.field(converter=_scalar, default=0.05)  # one covered less than this is left out
+    part: Float[Array, ""] = eqx.field(converter=_scalar, default=0.1)  # one covered less than this is left out
     max_step_m: Float[Array, ""] = eqx.field(converter=_scalar, default=0.05)  # of a surface between two frames
-    num_clusters: int = eqx.field(static=True, default=48)
+    num_clusters: int = eqx.field(static=True, default=192)
 
     def __check_init__(self) -> None:
         given = {name: leaf for name, leaf in vars(self).items() if not isinstance(leaf, Tracer)}
@@ -65,8 +65,6 @@ class TagAttentionPublished(AbstractTracer):
         if "v0_m_s" in given and not given["v0_m_s"] >= 0:
             raise ValueError(f"v0_m_s is {given['v0_m_s']:g}; expected at least 0.")
         check_positive_integers(num_clusters=self.num_clusters)
-        if self.num_clusters % _ROWS:
-            raise ValueError(f"num_clusters is {self.num_clusters}; expected a multiple of {_ROWS}, the rows of seeds.")
 
     def init(self, camera: Camera, frame: Frame) -> PublishedState:
         height, width = frame.depth_m.shape
@@ -106,7 +104,7 @@ class TagAttentionPublished(AbstractTracer):
         carried, _ = moved(jnp.moveaxis(state.log_likelihood, 0, -1), source, least)
 
         flat, known_flat = points.reshape(-1, 3), valid.reshape(-1)
-        seeds = seed_centres(points, valid, _ROWS, self.num_clusters // _ROWS)
+        seeds = seed_centres(points, valid, self.num_clusters)
         centres = jnp.where(state.num_frames > 0, state.centres_m, seeds)
         centres = k_means(flat[::_EVERY], known_flat[::_EVERY], centres, num_iterations=_ITERATIONS)
         cluster = assign(flat, centres)
@@ -149,9 +147,8 @@ class TagAttentionPublished(AbstractTracer):
         mask = refined(
             cut.reshape(-1), cluster, valid.reshape(-1), self.num_clusters, whole=self.whole, part=self.part
         ).reshape(shape)
-        count = jnp.sum(mask.astype(normal.dtype))
-        mean = jnp.sum(jnp.where(mask, normal, 0.0)) / jnp.maximum(count, 1.0)
-        raised = jnp.where(mask, jnp.maximum(normal, mean), normal)
+        mean, _ = means(normal.reshape(-1, 1), mask.reshape(-1), cluster, self.num_clusters)
+        raised = jnp.where(mask, jnp.maximum(normal, mean[cluster, 0].reshape(shape)), normal)
         return jnp.log(jnp.maximum(raised, self.lowest)), mask.astype(log_likelihood.dtype)
 
     def finish(self, state: PublishedState) -> PublishedState:
