@@ -1,7 +1,7 @@
 """Make a table of results from its recipe: measure it, write it as JSON and into its pages.
 
-python -m experiments.reproduce table=handheld               # interrupted, it resumes when it is started again
-python -m experiments.reproduce table=handheld render=true   # the Markdown again, from the JSON
+python -m experiments.reproduce table=suites               # interrupted, it resumes when it is started again
+python -m experiments.reproduce table=suites render=true   # the Markdown again, from the JSON
 python -m experiments.reproduce check=true                   # which tables are stale, and why
 """
 
@@ -26,9 +26,11 @@ def recipe_settings() -> list[Any]:
 
 
 def tracer_settings(name: str) -> dict[str, Any]:
-    """The settings of a tracer by name. Raises `ValueError` for a name that is no file of conf/tracer."""
+    """The settings of a tracer by name. Raises `ValueError` for a name that is neither `blobs` nor a file of conf/tracer."""
+    if name == "blobs":
+        return plain_values(OmegaConf.load(CONF / "system" / "blobs.yaml"))
     if name not in (known := sorted(path.stem for path in (CONF / "tracer").glob("*.yaml"))):
-        raise ValueError(f"tracer: found {name}; expected one of {', '.join(known)}.")
+        raise ValueError(f"tracer: found {name}; expected one of {', '.join([*known, 'blobs'])}.")
     return plain_values(compose(f"tracer/{name}").tracer)
 
 

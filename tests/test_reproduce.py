@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 from frame_scores import frame_scores
-from hydra import compose, initialize_config_dir
+from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
+from experiments.reproduce import tracer_settings
 from experiments.suites import suites_named
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.reproduce import measure as measuring
@@ -44,7 +45,7 @@ def _settings(path: Path) -> Any:
 
 def _tracer(name: str) -> Any:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return OmegaConf.to_container(compose(f"tracer/{name}").tracer)
+        return tracer_settings(name)
 
 
 SUITE = {
@@ -496,7 +497,10 @@ def test_a_table_is_made_with_all_that_its_values_can_be_computed_from(root: Pat
 
 
 @pytest.mark.ci
-def test_a_table_of_a_simulated_suite_is_made(root: Path):
+@pytest.mark.parametrize(
+    "system", [RECIPE["systems"]["online"], {"tracer": "blobs"}], ids=lambda system: system["tracer"]
+)
+def test_a_table_of_a_simulated_suite_is_made(root: Path, system: dict[str, Any]):
     """Nothing is replaced here: two small recordings are simulated, traced and scored."""
     suite = {
         **SUITE,
@@ -507,10 +511,10 @@ def test_a_table_of_a_simulated_suite_is_made(root: Path):
     }
     protocol = {"frames": [0, 16], "scores": {"min_pixels": 1}}
     make: Callable[[], dict[str, Any]] = lambda: make_table(  # noqa: E731
-        _recipe(protocols={"part": protocol}),
+        _recipe(protocols={"part": protocol}, systems={"online": system}),
         root,
         suites={"small": suite},
-        tracers={"tagattention_literal": _tracer("tagattention_literal")},
+        tracers={system["tracer"]: _tracer(system["tracer"])},
         recordings=root / "recordings",
         finished=root / "finished",
     )
@@ -554,14 +558,14 @@ def _follows_from(recipe: Recipe) -> dict[str, dict[str, Any]]:
 
 def test_tables_that_need_the_same_scores_share_them():
     """What one table has measured, the other takes from the folder of finished scores."""
-    main, handheld = (
+    main, suites = (
         _follows_from(from_mapping(Recipe, _settings(ROOT / "conf" / "table" / f"{name}.yaml")))
-        for name in ("main", "handheld")
+        for name in ("main", "suites")
     )
     for suite in ("single_static", "multi_4"):
-        for system in ("online", "offline", "paper"):
-            one = f"{suite}/test/whole/"
-            assert main[f"{one}handheld_{system}"] == handheld[f"{one}{system}"]
+        for one, other in (("handheld_online", "handheld"), ("handheld_published", "published")):
+            assert main[f"{suite}/test/whole/{one}"] == suites[f"{suite}/test/whole/{other}"]
+    assert main["walkers/test/whole/people_online"] == suites["walkers/test/whole/people"]
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
@@ -585,7 +589,7 @@ def test_no_json_is_without_a_recipe():
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [([], "expected table=<name>, one of .*handheld.*main"), (["table=magic"], "(?s)'table/magic'.*handheld.*main")],
+    [([], "expected table=<name>, one of .*main.*suites"), (["table=magic"], "(?s)'table/magic'.*main.*suites")],
 )
 def test_an_unknown_table_is_answered_with_those_there_are(words: list[str], message: str, tmp_path: Path):
     run = [sys.executable, "-m", "experiments.reproduce", *words, f"hydra.run.dir={tmp_path}"]

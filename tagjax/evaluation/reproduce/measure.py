@@ -10,9 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ...baselines import AbstractHostTracer, host_trace
+from ...baselines.blobs import BlobSettings, BlobTracer
 from ...core.results import to_json_values, write_json
 from ...core.settings import ConfigError, changed, from_mapping
-from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
+from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording, score_traces
 from ...recording.store import open_recording
 from ...sim.suites import Item, Suite, make_items
 from ...tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
@@ -21,6 +23,11 @@ from ...tracing.tracer import AbstractTracer
 from ...training.evaluate import parameters
 from .recipe import Job, Recipe
 from .scores import RecordingScores
+
+HOST_TRACERS: Mapping[str, Callable[[Mapping[str, Any]], AbstractHostTracer]] = {
+    "blobs": lambda settings: BlobTracer(from_mapping(BlobSettings, settings, where="blobs")),
+}
+"""Tracers that run on the host, with settings in conf/system, by name."""
 
 OnProgress = Callable[[str, int, int], None]
 """Called with a description of the current work, the number of finished recordings, and their total number."""
@@ -65,9 +72,9 @@ def measure(
 
 @dataclasses.dataclass(frozen=True)
 class Tracing:
-    """A tracer with all settings that determine its scores on a recording."""
+    """A tracer with all settings that determine its scores on a recording. A host tracer uses no `clips`."""
 
-    tracer: AbstractTracer
+    tracer: AbstractTracer | AbstractHostTracer
     settings: Mapping[str, Any]
     clips: ClipSettings
     scores_settings: ScoreSettings
@@ -86,9 +93,14 @@ class Tracing:
 
     def trace(self, path: Path) -> RecordingResult:
         """Trace and score the recording at `path`."""
+        recording = open_recording(path)
+        if isinstance(self.tracer, AbstractHostTracer):
+            epcs = recording.resolve_epcs(None)
+            traces = host_trace(self.tracer, recording, epcs=epcs, frames=self.frames)
+            return score_traces(traces, recording, epcs, settings=self.scores_settings, frames=self.frames)
         return evaluate_recording(
             self.tracer,
-            open_recording(path),
+            recording,
             clip_loader(self.clips),
             stride=self.clips.stride,
             epcs=self.clips.epcs,
@@ -104,14 +116,19 @@ class Tracing:
         suite = dataclasses.asdict(item.suite)
         for name in ("about", "paper", "counts", "variants"):  # about other recordings, or descriptions
             del suite[name]
+        on_host = isinstance(self.tracer, AbstractHostTracer)
         everything = {
             "recording": {"suite": suite, "variant": dataclasses.asdict(item.variant), "seed": item.seed},
             "name": item.name,
-            "tracer": {"settings": self.settings, "parameters": parameters(self.tracer)},
-            "clips": dataclasses.asdict(self.clips),
+            "tracer": {"settings": self.settings, "parameters": {} if on_host else parameters(self.tracer)},
+            "clips": {} if on_host else dataclasses.asdict(self.clips),
             "scores": dataclasses.asdict(self.scores_settings),
             "frames": self.frames,
-            "code": {path: content for path, content in code.items() if not path.endswith((".yaml", ".json"))},
+            "code": {
+                path: content
+                for path, content in code.items()
+                if not path.endswith((".yaml", ".json")) and (on_host or not path.startswith("tagjax/baselines/"))
+            },
         }
         return json.loads(json.dumps(to_json_values(everything)))
 
@@ -120,6 +137,10 @@ def _tracing(recipe: Recipe, inputs: Inputs, job: Job) -> Tracing:
     system, protocol = recipe.systems[job.system], recipe.protocols[job.protocol]
     settings = _settings_by_name("tracer", system.tracer, inputs.tracers)
     scores = changed(ScoreSettings(num_pictures=0), {**protocol.scores, **system.scores}, where="scores")
+    if system.tracer in HOST_TRACERS:
+        if system.weights is not None or system.clips:
+            raise ConfigError(f"system {job.system}: found weights or clips; {system.tracer} has neither.")
+        return Tracing(HOST_TRACERS[system.tracer](settings), settings, ClipSettings(), scores, protocol.frames)
     if system.weights is None:
         tracer, clips = make_tracer(settings), tracer_clips(settings)
     else:

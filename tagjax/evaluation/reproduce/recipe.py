@@ -33,7 +33,7 @@ class System:
     `clips` overrides the clip settings of the weights or of the tracer, `scores` those of the protocol.
     """
 
-    tracer: str  # the name of its settings in conf/tracer
+    tracer: str  # the name of its settings in conf/tracer, or `blobs` (conf/system)
     weights: str | None = None  # learned parameters: `default`, a name, or a file
     clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)
