@@ -26,12 +26,11 @@ def recipe_settings() -> list[Any]:
 
 
 def tracer_settings(name: str) -> dict[str, Any]:
-    """The settings of a tracer by name. Raises `ValueError` for a name that is neither `blobs` nor a file of conf/tracer."""
-    if name == "blobs":
-        return plain_values(OmegaConf.load(CONF / "system" / "blobs.yaml"))
-    if name not in (known := sorted(path.stem for path in (CONF / "tracer").glob("*.yaml"))):
-        raise ValueError(f"tracer: found {name}; expected one of {', '.join([*known, 'blobs'])}.")
-    return plain_values(compose(f"tracer/{name}").tracer)
+    """The settings of a tracer, or of `blobs`, by name. Raises `ValueError` for any other name."""
+    if name not in (known := [*sorted(path.stem for path in (CONF / "tracer").glob("*.yaml")), "blobs"]):
+        raise ValueError(f"tracer: found {name}; expected one of {', '.join(known)}.")
+    group = "system" if name == "blobs" else "tracer"
+    return plain_values(compose(f"{group}/{name}")[group])
 
 
 @command

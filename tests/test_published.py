@@ -171,9 +171,8 @@ def test_a_walk_without_noise_is_followed_over_hops_and_flips() -> None:
     carrier = 902.75e6 + 5e6 * channel
     phase = np.mod(4 * np.pi * carrier / 299_792_458.0 * path + channel + np.pi * (np.arange(200) % 7 == 0), 2 * np.pi)
     ones = jnp.ones(200)
-    reads = PhaseReads(
-        *(jnp.asarray(c, jnp.float32) for c in (time_s, phase, carrier, ones)), jnp.asarray(channel), ones > 0
-    )
+    time, angle, frequency = (jnp.asarray(column, jnp.float32) for column in (time_s, phase, carrier))
+    reads = PhaseReads(time, angle, frequency, ones, jnp.asarray(channel), ones > 0)
     np.testing.assert_allclose(unwrap_slots(reads), path - path[0], atol=2e-3)
 
 
@@ -183,10 +182,8 @@ def test_an_impossible_slot_goes_on_at_the_velocity_before() -> None:
     path = 0.3 * time_s + drop_m
     phase = np.mod(4 * np.pi * 915e6 / 299_792_458.0 * path, 2 * np.pi)
     ones = jnp.ones(len(time_s))
-    reads = PhaseReads(
-        *(jnp.asarray(c, jnp.float32) for c in (time_s, phase, 915e6 * np.ones(len(time_s)), ones)),
-        jnp.zeros(len(time_s), jnp.int32), ones > 0,
-    )  # fmt: skip
+    time, angle = (jnp.asarray(column, jnp.float32) for column in (time_s, phase))
+    reads = PhaseReads(time, angle, 915e6 * ones, ones, jnp.zeros(len(time_s), jnp.int32), ones > 0)
     with_rule, without = (np.asarray(unwrap_slots(reads, slots=slots)) for slots in (True, False))
     np.testing.assert_allclose(without, path, atol=1e-3)
     np.testing.assert_allclose(with_rule[42:], 0.3 * time_s[42:], atol=1e-3)
