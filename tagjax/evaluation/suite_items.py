@@ -1,0 +1,61 @@
+"""The recordings of suites by name and split; missing ones are simulated first."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..core.settings import ConfigError, from_mapping
+from ..recording import Recording
+from ..recording.store import open_recording
+from ..sim.suites import PLANAR, SPLITS, Item, Suite, make_items
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuiteSelection:
+    """Recordings of one split of some suites; `suites` holds each one's settings by name, as in the files of conf/suite."""
+
+    suites: Mapping[str, Mapping[str, Any]]
+    recordings_dir: str = "recordings"
+    split: str = "test"
+    max_recordings: int | None = None  # of each variant; all if None
+    smoke: bool = False
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.suites:
+            raise ConfigError("suites is empty; expected names of suites, for example suites=[single_static,multi_4].")
+        if self.split not in SPLITS:
+            raise ConfigError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
+        if self.max_recordings is not None and self.max_recordings < 1:
+            raise ConfigError(
+                f"max_recordings is {self.max_recordings}; expected at least 1 recording of each variant."
+            )
+        if self.workers < 1:
+            raise ConfigError(f"workers is {self.workers}; expected at least 1 process.")
+
+    def items(self, name: str, report: Callable[[str], None] = lambda _: None) -> list[Item]:
+        """A suite's items, simulated where they are missing. Raises `ConfigError` where it has none, or no pictures."""
+        suite = from_mapping(Suite, self.suites[name], where=f"suite {name}")
+        suite = suite.smoke() if self.smoke else suite
+        if suite.story == PLANAR:
+            raise ConfigError(f"{suite.name} has lines of reads and no pictures; choose another suite.")
+        items = make_items(
+            suite,
+            Path(self.recordings_dir),
+            splits=(self.split,),
+            max_per_variant=self.max_recordings,
+            workers=self.workers,
+            on_done=lambda one: report(f"simulated {one.name}"),
+        )
+        if not items:
+            raise ConfigError(f"{suite.name} has no {self.split} recording; choose another split, or raise its counts.")
+        return items
+
+    def recordings(self, name: str, report: Callable[[str], None] = lambda _: None) -> Iterator[tuple[Item, Recording]]:
+        """A suite's items with their recordings, opened one after the other."""
+        for item in self.items(name, report):
+            report(item.name)
+            yield item, open_recording(item.path(Path(self.recordings_dir)))
