@@ -89,4 +89,13 @@ def test_commands_are_found_with_their_arguments_and_without_comments() -> None:
 
 def test_there_are_commands_of_most_experiments() -> None:
     named = {param.values[0] for param in _documented()}
-    assert named >= set(SCHEMAS) | {"compare", "tracks", "benchmark", "import_recording", "sweep_paper", "tagvision"}
+    assert named >= set(SCHEMAS) | {
+        "compare",
+        "error_budget",
+        "reads_ceiling",
+        "tracks",
+        "benchmark",
+        "import_recording",
+        "sweep_paper",
+        "tagvision",
+    }

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..core.numerics import safe_sqrt
 from ..radio.reads import PhaseReads, RadioWindow
-from ..tracing.tracer import BackwardMessage, Camera, Frame, Trace
+from ..tracing.tracer import MAX_OBJECTS, BackwardMessage, Camera, Frame, Trace
 from ._evidence import AbstractEvidence
 from .anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
 from .background import Background, empty_background, is_background, remember, shows_rest
@@ -20,7 +20,7 @@ from .frame_trace import describe
 from .motion import MotionMap, PlaceMap, carry, empty_motion, empty_places, push_gather, push_places
 from .phase_memory import PhaseMemory, carry_phases
 from .propagation import propagate, rival_log_odds, soft_clip
-from .segmentation import cdf_cut, compact_cut, diffuse, pool, unpool
+from .segmentation import cdf_cut, compact_cut, diffuse, membership, pool, unpool
 from .view import Grouping, Ranging, View, elapsed_s, of_each_antenna, view_of
 
 SIGNIFICANCE = 1e-3
@@ -146,7 +146,8 @@ class AbstractStages(AbstractEvidence):
             pool_motion=jax.nn.sigmoid(self.logit_pool_motion),
             cell=self.cell,
         )
-        view = view_of(camera, points, distances, valid, motion, step_m, time_s, state.background, grouping)
+        objects = None if frame.objects is None else membership(frame.objects, MAX_OBJECTS)
+        view = view_of(camera, points, distances, valid, motion, step_m, time_s, state.background, grouping, objects)
 
         both = jnp.moveaxis(jnp.concatenate([state.log_odds, state.fate]), 0, -1)
         moved, fate = jnp.split(jnp.moveaxis(carry(both, backward_px, jnp.zeros(())), -1, 0), 2)

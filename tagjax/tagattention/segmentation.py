@@ -5,13 +5,16 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 _FAR = 1e30
 
 
 class Segments(eqx.Module):
     """Soft K-means segments on a grid of cells: each pixel belongs to the 3 x 3 segments around its own cell.
+
+    With `objects` the pixels of each given object belong to one segment of its own, and to no other.
 
     `share` sums to 1 over its first axis for valid pixels and to 0 for the others; neighbour n of a pixel in cell
     (i, j) is the segment (i + n // 3 - 1, j + n % 3 - 1).
@@ -20,6 +23,12 @@ class Segments(eqx.Module):
     share: Float[Array, "9 height width"]
     weight: Float[Array, "rows columns"]  # pixels in each segment
     cell: int = eqx.field(static=True)
+    objects: Float[Array, "object height width"] | None = None  # membership of given objects, 0 or 1
+
+    @property
+    def num_cell_rows(self) -> int:
+        """Rows of the grid that are cells of the picture; given objects are segments in rows below these."""
+        return -(-self.share.shape[1] // self.cell)
 
 
 def _blocks(image: Float[Array, "height width channel"], cell: int) -> Float[Array, "channel rows cell columns cell"]:
@@ -63,14 +72,20 @@ def segment(
     *,
     cell: int,
     num_iterations: int = 3,
+    objects: Float[Array, "object height width"] | None = None,
 ) -> Segments:
     """Soft K-means of pixel features (3D position in metres first), seeded by cells of the picture.
+
+    Pixels of the given `objects` are segments of their own (`Segments.objects`).
 
     Assignments are softmax(-||f - c||^2 / (2 temperature^2)) over the nine nearest seeds (the local search of SLIC:
     Achanta et al., 2012), so the cost does not grow with the number of segments; temperature -> 0 is hard K-means
     (TagAttention, III.G, after Jaimez et al., 2017).
     """
     height, width, _ = features.shape
+    if objects is not None:
+        objects = jnp.where(valid[None], objects, 0.0)
+        valid = valid & (jnp.sum(objects, axis=0) == 0)
     known = _blocks(valid.astype(features.dtype)[..., None], cell)
     pixels = jnp.concatenate([_blocks(jnp.where(valid[..., None], features, 0.0), cell), known])
 
@@ -91,7 +106,22 @@ def segment(
         return centres(_summed(assign(seeds), pixels)), None
 
     seeds, _ = jax.lax.scan(iterate, centres(jnp.sum(pixels, axis=(2, 4))), None, length=num_iterations)
-    return Segments(share=_whole(assign(seeds), height, width), weight=seeds[-1], cell=cell)
+    weight = seeds[-1]
+    if objects is not None:
+        weight = jnp.concatenate([weight, _below(jnp.sum(objects, axis=(1, 2))[:, None], weight.shape[1])[..., 0]])
+    return Segments(_whole(assign(seeds), height, width), weight, cell, objects)
+
+
+def _places(num: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Row below the cells, and column, of each given object: none is next to a cell or to another object."""
+    row, column = np.divmod(np.arange(num), -(-columns // 2))
+    return 2 * row + 1, 2 * column
+
+
+def _below(values: Float[Array, "object channel"], columns: int) -> Float[Array, "rows columns channel"]:
+    """Values of given objects as rows below the grid of cells; zero between them."""
+    row, column = _places(values.shape[0], columns)
+    return jnp.zeros((int(row[-1]) + 1, columns, values.shape[1]), values.dtype).at[row, column].set(values)
 
 
 def pool(
@@ -101,6 +131,9 @@ def pool(
     stacked = jnp.concatenate([values * weight[..., None], weight[..., None]], axis=-1)
     share = _blocks(jnp.moveaxis(segments.share, 0, -1), segments.cell)
     summed = jnp.moveaxis(_summed(share, _blocks(stacked, segments.cell)), 0, -1)
+    if segments.objects is not None:
+        sums = jnp.einsum("ohw,hwc->oc", segments.objects, stacked)
+        summed = jnp.concatenate([summed, _below(sums, summed.shape[1])])
     mass = summed[..., -1]
     mean = summed[..., :-1] / jnp.where(mass > 1e-6, mass, 1.0)[..., None]
     return jnp.where(mass[..., None] > 1e-6, mean, 0.0), mass
@@ -110,9 +143,20 @@ def unpool(segments: Segments, grid: Float[Array, "rows columns channel"]) -> Fl
     """Segment values handed back to the pixels by their shares."""
     _, height, width = segments.share.shape
     share = _blocks(jnp.moveaxis(segments.share, 0, -1), segments.cell)
-    near = jnp.stack(_shifted(jnp.moveaxis(grid, -1, 0)))
+    cells = grid[: segments.num_cell_rows]
+    near = jnp.stack(_shifted(jnp.moveaxis(cells, -1, 0)))
     spread = jnp.einsum("nrycx,nfrc->frycx", share, near)
-    return jnp.moveaxis(_whole(spread, height, width), 0, -1)
+    values = jnp.moveaxis(_whole(spread, height, width), 0, -1)
+    if segments.objects is None:
+        return values
+    row, column = _places(segments.objects.shape[0], grid.shape[1])
+    own = grid[segments.num_cell_rows :][row, column]
+    return values + jnp.einsum("ohw,oc->hwc", segments.objects, own)
+
+
+def membership(objects: Int[Array, "height width"], num: int) -> Float[Array, "object height width"]:
+    """Membership of pixels in objects that are numbered from 1 to `num`."""
+    return jnp.moveaxis(jax.nn.one_hot(objects - 1, num), -1, 0)
 
 
 def diffuse(

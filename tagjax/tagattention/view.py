@@ -78,13 +78,14 @@ def view_of(
     time_s: Float[Array, " window"],
     background: Background,
     grouping: Grouping,
+    objects: Float[Array, "object height width"] | None = None,
 ) -> View:
     """Segments, their motion, and what stands in front: once a frame, for all tags.
 
     The first antenna's distances serve where one will do: for the segments' motion, and for the background.
     """
     features = _features(camera, points_m, valid, step_m[0], elapsed_s(time_s), grouping)
-    segments = segment(features, valid, grouping.temperature, cell=grouping.cell)
+    segments = segment(features, valid, grouping.temperature, cell=grouping.cell, objects=objects)
     rho, known, rho_segment = of_each_antenna(lambda one: _pooled_motion(segments, one, grouping.pool_motion), motion)
     means, mass = pool(
         segments,

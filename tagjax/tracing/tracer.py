@@ -8,10 +8,13 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ..core.numerics import safe_norm
 from ..radio.reads import PhaseReads, RadioWindow
+
+MAX_OBJECTS = 32
+"""Objects that a frame can give."""
 
 
 class Camera(eqx.Module):
@@ -51,6 +54,10 @@ class Frame(eqx.Module):
     reads: PhaseReads  # (*time, tag, antenna, read): the reads within this frame's window
     colour: UInt8[Array, "*time rows columns 3"] | None = None  # full-size picture, for tracers that compute the flow
     backward_message: BackwardMessage | None = None  # offline smoothing only
+    objects: Int[Array, "*time height width"] | None = (
+        None  # 1 to `MAX_OBJECTS` on given objects, 0 elsewhere; each is a
+    )
+    # segment in place of the tracer's own: to measure what errors of the segments cost
 
 
 class Trace(eqx.Module):

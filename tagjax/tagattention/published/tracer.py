@@ -11,10 +11,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ...core.parameters import check_fractions, check_positive, check_positive_integers
-from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
+from ...tracing.tracer import MAX_OBJECTS, AbstractTracer, Camera, Frame, Trace
 from ..attention import att_corr, att_rbf, attention
 from ..frame_trace import describe
 from ..propagation import radio_speed
@@ -107,7 +107,11 @@ class TagAttentionPublished(AbstractTracer):
         seeds = seed_centres(points, valid, self.num_clusters)
         centres = jnp.where(state.num_frames > 0, state.centres_m, seeds)
         centres = k_means(flat[::_EVERY], known_flat[::_EVERY], centres, num_iterations=_ITERATIONS)
-        cluster = assign(flat, centres)
+        cluster, num_clusters = assign(flat, centres), self.num_clusters
+        if frame.objects is not None:
+            objects = frame.objects.reshape(-1)
+            cluster = jnp.where(objects > 0, num_clusters + objects - 1, cluster)
+            num_clusters += MAX_OBJECTS
 
         def one_tag(
             log_likelihood: Float[Array, "height width"],
@@ -121,7 +125,7 @@ class TagAttentionPublished(AbstractTracer):
             agreement = jnp.maximum(jnp.where(complete, agreement, 0.0), self.floor)
             moves = jnp.all(jnp.isfinite(std_m)) & (radio_speed(rd, time_s) >= self.v0_m_s)
             log_likelihood = log_likelihood + jnp.where(moves, jnp.log(agreement), 0.0)
-            return self._masked(log_likelihood, valid, cluster)
+            return self._masked(log_likelihood, valid, cluster, num_clusters)
 
         likelihood, mask = jax.vmap(one_tag)(
             jnp.moveaxis(carried, -1, 0), frame.radio.relative_m[:, 0], frame.radio.std_m[:, 0]
@@ -134,7 +138,11 @@ class TagAttentionPublished(AbstractTracer):
         return after, trace
 
     def _masked(
-        self, log_likelihood: Float[Array, "height width"], valid: Bool[Array, "height width"], cluster: Array
+        self,
+        log_likelihood: Float[Array, "height width"],
+        valid: Bool[Array, "height width"],
+        cluster: Int[Array, " pixel"],
+        num_clusters: int,
     ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
         """The refined likelihood, which is propagated, and the refined mask; where nothing stands out, no mask."""
         top = jnp.max(jnp.where(valid, log_likelihood, -jnp.inf))
@@ -145,7 +153,7 @@ class TagAttentionPublished(AbstractTracer):
         cut = valid & (normal >= self.cut) & (spread > 0)
         shape = valid.shape
         mask = refined(
-            cut.reshape(-1), cluster, valid.reshape(-1), self.num_clusters, whole=self.whole, part=self.part
+            cut.reshape(-1), cluster, valid.reshape(-1), num_clusters, whole=self.whole, part=self.part
         ).reshape(shape)
         mean, _ = means(normal.reshape(-1, 1), mask.reshape(-1), cluster, self.num_clusters)
         raised = jnp.where(mask, jnp.maximum(normal, mean[cluster, 0].reshape(shape)), normal)
