@@ -17,6 +17,7 @@ LAYERS = {
     "suites": 5,
     "contact_sheet": 6,
     "link_budgets": 6,
+    "flow_truth": 6,
 }
 """Layer of each part of the simulator. Two parts of one layer do not import each other."""
 

@@ -107,11 +107,10 @@ class TagAttentionPublished(AbstractTracer):
         seeds = seed_centres(points, valid, self.num_clusters)
         centres = jnp.where(state.num_frames > 0, state.centres_m, seeds)
         centres = k_means(flat[::_EVERY], known_flat[::_EVERY], centres, num_iterations=_ITERATIONS)
-        cluster, num_clusters = assign(flat, centres), self.num_clusters
+        cluster = assign(flat, centres)
         if frame.objects is not None:
             objects = frame.objects.reshape(-1)
-            cluster = jnp.where(objects > 0, num_clusters + objects - 1, cluster)
-            num_clusters += MAX_OBJECTS
+            cluster = jnp.where(objects > 0, self.num_clusters + objects - 1, cluster)
 
         def one_tag(
             log_likelihood: Float[Array, "height width"],
@@ -125,7 +124,7 @@ class TagAttentionPublished(AbstractTracer):
             agreement = jnp.maximum(jnp.where(complete, agreement, 0.0), self.floor)
             moves = jnp.all(jnp.isfinite(std_m)) & (radio_speed(rd, time_s) >= self.v0_m_s)
             log_likelihood = log_likelihood + jnp.where(moves, jnp.log(agreement), 0.0)
-            return self._masked(log_likelihood, valid, cluster, num_clusters)
+            return self._masked(log_likelihood, valid, cluster)
 
         likelihood, mask = jax.vmap(one_tag)(
             jnp.moveaxis(carried, -1, 0), frame.radio.relative_m[:, 0], frame.radio.std_m[:, 0]
@@ -142,7 +141,6 @@ class TagAttentionPublished(AbstractTracer):
         log_likelihood: Float[Array, "height width"],
         valid: Bool[Array, "height width"],
         cluster: Int[Array, " pixel"],
-        num_clusters: int,
     ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
         """The refined likelihood, which is propagated, and the refined mask; where nothing stands out, no mask."""
         top = jnp.max(jnp.where(valid, log_likelihood, -jnp.inf))
@@ -153,7 +151,12 @@ class TagAttentionPublished(AbstractTracer):
         cut = valid & (normal >= self.cut) & (spread > 0)
         shape = valid.shape
         mask = refined(
-            cut.reshape(-1), cluster, valid.reshape(-1), num_clusters, whole=self.whole, part=self.part
+            cut.reshape(-1),
+            cluster,
+            valid.reshape(-1),
+            self.num_clusters + MAX_OBJECTS,
+            whole=self.whole,
+            part=self.part,
         ).reshape(shape)
         mean, _ = means(normal.reshape(-1, 1), mask.reshape(-1), cluster, self.num_clusters)
         raised = jnp.where(mask, jnp.maximum(normal, mean[cluster, 0].reshape(shape)), normal)
