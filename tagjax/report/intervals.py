@@ -44,7 +44,7 @@ def marker_plot(path: Path, rows: Sequence[MarkedRow], *, xlabel: str) -> None:
             low.append(ends[0])
             high.append(ends[1])
         x, y = np.array(values), np.array(places)
-        errors = np.nan_to_num(np.stack([x - np.array(low), np.array(high) - x]))
+        errors = np.stack([x - np.array(low), np.array(high) - x])  # NaN, and not drawn, without an interval
         marker = _MARKERS[number % len(_MARKERS)]
         axes.errorbar(x, y, xerr=errors, fmt=marker, markersize=4, label=name, clip_on=False, **_INTERVAL)
     for place, height, row in zip(at, heights, rows, strict=True):
@@ -54,14 +54,17 @@ def marker_plot(path: Path, rows: Sequence[MarkedRow], *, xlabel: str) -> None:
     axes.set(xlim=(0, 1), ylim=(float(heights.sum()), 0), xlabel=xlabel)
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper center", ncols=min(len(series), 4), fontsize=8, frameon=False)
+    figure.legend(loc="outside upper center", ncols=min(len(series), 2), fontsize=8, frameon=False)
     save_figure(figure, path, dpi=120)
 
 
-def interval_bars(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, Estimate]]], *, columns: int) -> None:
+def interval_bars(
+    path: Path, panels: Mapping[str, Mapping[str, Mapping[str, Estimate]]], *, columns: int, ylabel: str = ""
+) -> None:
     """Write a figure of panels, row by row: a group of horizontal bars a label, one bar a series, from 0 to 1.
 
-    `panels` maps a title to the estimates by series and label. Labels of the first column's panels are drawn once.
+    `panels` maps a title to the estimates by series and label. A dotted line goes on from each series' first bar, and a
+    cross stands for an undefined value.
     """
     first = next(iter(panels.values()))
     series, labels = list(first), list(next(iter(first.values())))
@@ -74,8 +77,10 @@ def interval_bars(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, Est
         for number, name in enumerate(series):
             at = np.arange(len(labels)) + (number - (len(series) - 1) / 2) * thick
             value, low, high = np.array([_with_ends(by_series.get(name, {}).get(label)) for label in labels]).T
-            errors = np.nan_to_num(np.stack([value - low, high - value]))
-            axes.barh(at, np.nan_to_num(value), 0.9 * thick, xerr=errors, label=name, error_kw=_INTERVAL)
+            errors = np.stack([value - low, high - value])  # NaN, and not drawn, without an interval
+            bars = axes.barh(at, np.nan_to_num(value), 0.9 * thick, xerr=errors, label=name, error_kw=_INTERVAL)
+            if np.isfinite(value[0]):
+                axes.axvline(value[0], color=bars.patches[0].get_facecolor(), linestyle=":", linewidth=1.0, zorder=0)
             axes.plot(np.full(np.isnan(value).sum(), 0.02), at[np.isnan(value)], "x", color="0.5", markersize=5)
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_xlim(0, 1)
@@ -84,7 +89,11 @@ def interval_bars(path: Path, panels: Mapping[str, Mapping[str, Mapping[str, Est
         axes.spines[["top", "right"]].set_visible(False)
     for axes in grid.ravel()[len(panels) :]:
         axes.set_axis_off()
-    grid[0, 0].set_yticks(np.arange(len(labels)), labels, fontsize=9)
+    for axes in grid[:, 0]:
+        axes.set_yticks(np.arange(len(labels)), labels)
+        axes.set_ylabel(ylabel, fontsize=9)
+    for axes in grid.ravel():
+        axes.tick_params(labelsize=8)
     grid[0, 0].invert_yaxis()
     if len(series) > 1:
         handles, names = grid[0, 0].get_legend_handles_labels()

@@ -95,4 +95,4 @@ def _write(folder: Path, rows: list[BudgetRow]) -> None:
         for name, heading in MEASURES.items():
             panel = panels.setdefault(f"{row.tracer}: {heading}", {})
             panel.setdefault(row.suite, {})[row.truth] = row.estimates[name]
-    interval_bars(folder / "error_budget.png", panels, columns=len(MEASURES))
+    interval_bars(folder / "error_budget.png", panels, columns=len(MEASURES), ylabel="truth in place of")
