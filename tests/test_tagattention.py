@@ -1,6 +1,7 @@
 """The tracers: the paper's update step by step, the learnable one's gradients, determinism and degenerate input."""
 
 import functools
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
+import tagjax
 from tagjax.core.geometry import pixel_rays
 from tagjax.radio.reads import RadioWindow
 from tagjax.recording import Intrinsics
@@ -361,11 +363,22 @@ def test_even_odds_are_no_claim():
 
 
 def test_only_frames_and_reads_enter(clip):
-    """A tracer's input holds no labels: what it says cannot depend on truth.
+    """The input of a tracer holds no labels, so its output cannot depend on truth; only error budgets give `objects`.
 
     `colour` is for flow networks that learn; `later` is what such a pass backwards found.
     """
-    assert {"time_s", "depth_m", "backward_px", "forward_px", "radio", "reads", "colour", "backward_message"} == set(
-        Frame.__dataclass_fields__
-    )
+    assert {
+        "time_s",
+        "depth_m",
+        "backward_px",
+        "forward_px",
+        "radio",
+        "reads",
+        "colour",
+        "backward_message",
+        "objects",
+    } == set(Frame.__dataclass_fields__)
+    assert clip.frames.objects is None
+    givers = {path.name for path in Path(tagjax.__file__).parent.rglob("*.py") if "frames.objects" in path.read_text()}
+    assert givers == {"objects.py"}
     assert {"log_odds", "anchor", "moved"} == set(BackwardMessage.__dataclass_fields__)

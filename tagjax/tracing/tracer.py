@@ -14,7 +14,7 @@ from ..core.numerics import safe_norm
 from ..radio.reads import PhaseReads, RadioWindow
 
 MAX_OBJECTS = 32
-"""Objects that a frame can give."""
+"""Objects that a frame can give, numbered from 1; each is a segment in place of the tracer's own."""
 
 
 class Camera(eqx.Module):
@@ -54,10 +54,7 @@ class Frame(eqx.Module):
     reads: PhaseReads  # (*time, tag, antenna, read): the reads within this frame's window
     colour: UInt8[Array, "*time rows columns 3"] | None = None  # full-size picture, for tracers that compute the flow
     backward_message: BackwardMessage | None = None  # offline smoothing only
-    objects: Int[Array, "*time height width"] | None = (
-        None  # 1 to `MAX_OBJECTS` on given objects, 0 elsewhere; each is a
-    )
-    # segment in place of the tracer's own: to measure what errors of the segments cost
+    objects: Int[Array, "*time height width"] | None = None  # error budgets only: given objects, 0 = none
 
 
 class Trace(eqx.Module):
