@@ -149,16 +149,10 @@ class TagAttentionPublished(AbstractTracer):
         spread = jnp.where(jnp.isfinite(least), 1.0 - least, 0.0)
         normal = jnp.where(valid & (spread > 0), (odds - least) / jnp.where(spread > 0, spread, 1.0), 0.0)
         cut = valid & (normal >= self.cut) & (spread > 0)
-        shape = valid.shape
-        mask = refined(
-            cut.reshape(-1),
-            cluster,
-            valid.reshape(-1),
-            self.num_clusters + MAX_OBJECTS,
-            whole=self.whole,
-            part=self.part,
-        ).reshape(shape)
-        mean, _ = means(normal.reshape(-1, 1), mask.reshape(-1), cluster, self.num_clusters)
+        shape, num = valid.shape, self.num_clusters + MAX_OBJECTS
+        mask = refined(cut.reshape(-1), cluster, valid.reshape(-1), num, whole=self.whole, part=self.part)
+        mean, _ = means(normal.reshape(-1, 1), mask, cluster, num)
+        mask = mask.reshape(shape)
         raised = jnp.where(mask, jnp.maximum(normal, mean[cluster, 0].reshape(shape)), normal)
         return jnp.log(jnp.maximum(raised, self.lowest)), mask.astype(log_likelihood.dtype)
 
