@@ -36,7 +36,9 @@ class Background:
     variance: Float[np.ndarray, "height width"]  # of the colour, levels squared, summed over channels
 
 
-_START_VARIANCE = 300.0
+_KERNEL = np.ones((3, 3), np.uint8)
+_START_VARIANCE = 300.0  # levels squared, summed over channels
+_MIN_VARIANCE = 30.0  # quantisation and compression
 _COLOUR_SIGMAS = 4.0
 _SLOW = 0.1
 """The background follows what it takes for foreground ten times as slowly as the rest, and depth that recedes at once."""
@@ -51,8 +53,8 @@ def foreground(
 ) -> tuple[Bool[np.ndarray, "height width"], Background]:
     """Pixels that are nearer than the background, or of another colour; and the background after this frame.
 
-    Everything of the first frame is background. Where depth is measured and equal to the background's, colour alone
-    (shadows, light) makes no foreground.
+    Everything of the first frame is background. Colour decides only where the depth of the pixel or of its background is
+    missing, so that shadows and light make no foreground elsewhere.
     """
     smooth = cv2.GaussianBlur(colour, (0, 0), 1.0).astype(np.float32)
     if background is None:
@@ -67,13 +69,13 @@ def foreground(
     rate = min(elapsed_s / settings.background_s, 1.0)
     own = np.where(moving, _SLOW * rate, rate).astype(np.float32)
     receded = measured & known & (depth_m > background.depth_m + slack)
-    blend = np.where(receded | ~known, 1.0, own)
+    blend = np.where(receded, 1.0, np.where(known, own, ~moving))
     depth = np.where(measured, background.depth_m + blend * (depth_m - background.depth_m), background.depth_m)
     variance = background.variance + np.where(moving, 0.0, own) * (squared - background.variance)
     after = Background(
         depth.astype(np.float32),
         background.colour + own[..., None] * (smooth - background.colour),
-        np.maximum(variance, 30.0).astype(np.float32),
+        np.maximum(variance, _MIN_VARIANCE).astype(np.float32),
     )
     return moving, after
 
@@ -82,22 +84,39 @@ def connected_parts(
     moving: Bool[np.ndarray, "height width"],
     depth_m: Float[np.ndarray, "height width"],
     rays: Float[np.ndarray, "height width 3"],
-    settings: BlobSettings,
+    edge_m: float,
+    min_area_m2: float,
+    *,
+    bridge: bool = False,
 ) -> list[Blob]:
     """Parts of the foreground that are connected in space, with a surface of at least `min_area_m2`; the largest first.
 
-    Pixels at a step in depth, and those without depth, belong to none. `rays` are ((x - cx) / fx, (y - cy) / fy, 1).
+    Pixels within which the foreground's depth changes by more than `edge_m` separate parts and belong to none. Foreground
+    without depth takes that of the nearest foreground with depth: dark cloth does not reflect the sensor's light. `bridge`
+    closes gaps of the foreground two pixels wide. `rays` are ((x - cx) / fx, (y - cy) / fy, 1).
     """
-    solid = cv2.morphologyEx((moving & (depth_m > 0)).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    span = cv2.dilate(depth_m, np.ones((3, 3), np.uint8)) - cv2.erode(
-        np.where(depth_m > 0, depth_m, np.float32(1e3)), np.ones((3, 3), np.uint8)
-    )
-    solid[span > settings.edge_m] = 0
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
-    pixel_m2 = _pixel_area_m2(depth_m, rays)
-    area_m2 = np.bincount(labels.reshape(-1), pixel_m2.reshape(-1), count)
-    order = [int(label) for label in np.argsort(-area_m2) if label and area_m2[label] >= settings.min_area_m2]
+    known = moving & (depth_m > 0)
+    if not known.any():
+        return []
+    solid = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_CLOSE, _KERNEL) if bridge else moving.astype(np.uint8)
+    solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, _KERNEL) > 0
+    depth_m = np.where(known, depth_m, _of_nearest(depth_m, known)).astype(np.float32)
+    low = cv2.erode(np.where(solid, depth_m, np.float32(np.inf)), _KERNEL)
+    high = cv2.dilate(np.where(solid, depth_m, np.float32(0)), _KERNEL)
+    smooth = solid & (high - low <= edge_m)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(smooth.astype(np.uint8), connectivity=8)
+    area_m2 = np.bincount(labels.reshape(-1), _pixel_area_m2(depth_m, rays).reshape(-1), count)
+    order = [int(label) for label in np.argsort(-area_m2) if label and area_m2[label] >= min_area_m2]
     return [_blob(label, labels, stats[label], depth_m, rays) for label in order]
+
+
+def _of_nearest(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """At each pixel the value of the nearest pixel that is `there`; at least one must be."""
+    _, zone = cv2.distanceTransformWithLabels((~there).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    zone = np.asarray(zone, np.int64)
+    of_zone = np.zeros(int(zone.max()) + 1, values.dtype)
+    of_zone[zone[there]] = values[there]
+    return of_zone[zone]
 
 
 def _pixel_area_m2(depth_m: np.ndarray, rays: np.ndarray) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""The blob tracer: blobs, tracks, and for each tag the track of which the range explains its phases best."""
+"""The blob tracer: blobs, tracks, and for each tag the track of which the range explains its phases best.
+
+Bodies are tracked as a whole and in parts, side by side. A tag's phases decide whether its object is the whole (a badge on a
+person) or a part (a bottle in a hand).
+"""
 
 from __future__ import annotations
 
@@ -15,12 +19,9 @@ from ...tracing.tracer import Trace
 from ..host_tracer import AbstractHostTracer, Detection, HostCamera, HostFrame, trace_from_detections
 from ..reads import range_phase_rad
 from .detection import Background, connected_parts, foreground
-from .matching import coherence_of_ranges
+from .matching import coherent_evidence
 from .settings import BlobSettings
 from .tracks import Track, follow
-
-_DETECTED = 0.5
-"""Half of the confidence scale: the coherence gained is mapped to the upper half."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +63,13 @@ class BlobTracer(AbstractHostTracer):
             raise ValueError("The blob tracer needs depth; found a frame without.")
         elapsed_s = frame.time_s - state.time_s if np.isfinite(state.time_s) else 0.0
         moving, background = foreground(state.background, frame.colour, frame.depth_m, elapsed_s, settings)
-        blobs = connected_parts(moving, frame.depth_m, self._rays_of(camera), settings)
-        tracks, number = follow(state.tracks, blobs, frame.time_s, elapsed_s, state.next_number, settings)
+        tracks: tuple[Track, ...] = ()
+        number, rays = state.next_number, self._rays_of(camera)
+        for part, edge_m in ((False, settings.whole_edge_m), (True, settings.part_edge_m)):
+            blobs = connected_parts(moving, frame.depth_m, rays, edge_m, settings.min_area_m2, bridge=not part)
+            own = [one for one in state.tracks if one.part == part]
+            followed, number = follow(own, blobs, frame.time_s, elapsed_s, number, settings, part=part)
+            tracks += followed
         seen = {track.number: track.position_m for track in tracks if track.blob is not None}
         begin_s = frame.time_s - settings.memory_s
         usable = np.isfinite(frame.reads.carrier_hz) & (frame.reads.antenna >= 1)
@@ -93,38 +99,36 @@ class BlobTracer(AbstractHostTracer):
         """Each tag's track of this frame, by the best assignment of tags to tracks that explain their phases."""
         settings = self.settings
         old = [one for one in state.tracks if one.blob is not None and state.time_s - one.born_s >= settings.confirm_s]
-        gains, coherences = (np.zeros((len(camera.epcs), len(old))) for _ in range(2))
+        evidence = np.zeros((len(camera.epcs), len(old)))
         for tag, epc in enumerate(camera.epcs):
-            coherences[tag], still = self._coherences(camera, state, epc, [one.number for one in old])
-            gains[tag] = np.where(coherences[tag] >= settings.min_coherence, coherences[tag] - still, -np.inf)
-        chosen = hard_assignment(gains, unmatched_score=settings.min_gain)
+            evidence[tag] = self._evidence(camera, state, epc, [one.number for one in old])
+        chosen = hard_assignment(evidence, unmatched_score=settings.min_evidence)
+        part = np.array([one.part for one in old], bool)
         found: list[Detection | None] = []
         for tag, column in enumerate(chosen):
             blob = old[column].blob if column >= 0 else None
             if blob is None:
                 found.append(None)
                 continue
-            confidence = _DETECTED + (1 - _DETECTED) * float(np.clip(gains[tag, column], 0.0, 1.0))
+            # A body and its part have nearly the same evidence and are no alternatives: each has its own confidence.
+            alternatives = np.append(evidence[tag, part == part[column]], 0.0)
+            confidence = float(np.exp(evidence[tag, column] - np.logaddexp.reduce(alternatives)))
             step_m = self._last_step_m(camera, state, old[column].number)
             found.append(Detection(blob.full_mask(shape), old[column].position_m, confidence, step_m=step_m))
         return found
 
-    def _coherences(
+    def _evidence(
         self, camera: HostCamera, state: BlobState, epc: str, numbers: list[int]
-    ) -> tuple[Float[np.ndarray, " tracks"], np.ndarray]:
-        """Coherence of a tag's reads with each track's range, and with a range that stays, over the same reads."""
+    ) -> Float[np.ndarray, " tracks"]:
+        """The evidence of a tag's reads for each track."""
         own = state.reads.epc == epc
         reads, time_s = state.reads[own], state.read_time_s[own]
-        none = np.zeros(len(numbers))
-        if reads.num_reads < self.settings.min_reads or not numbers:
-            return none, none
+        if not reads.num_reads or not numbers:
+            return np.zeros(len(numbers))
         range_m = np.stack([self._range_m(camera, state, number, reads, time_s) for number in numbers])
         phase, pairs = range_phase_rad(reads), np.stack([reads.antenna, reads.carrier_hz])
         channel = np.unique(pairs, axis=1, return_inverse=True)[1].reshape(-1)
-        enough = np.sum(np.isfinite(range_m), axis=1) >= self.settings.min_reads
-        moving = coherence_of_ranges(phase, reads.carrier_hz, channel, range_m)
-        still = coherence_of_ranges(phase, reads.carrier_hz, channel, np.where(np.isfinite(range_m), 0.0, np.nan))
-        return np.where(enough, moving, 0.0), np.where(enough, still, 0.0)
+        return coherent_evidence(phase, reads.carrier_hz, channel, range_m, self.settings.phase_std_rad)
 
     @staticmethod
     def _range_m(

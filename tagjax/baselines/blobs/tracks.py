@@ -12,6 +12,8 @@ from ...core.assignment import hard_assignment
 from .detection import Blob
 from .settings import BlobSettings
 
+_START_SPEED_M_S = 1.0  # standard deviation of a new track's velocity
+
 
 @dataclasses.dataclass(frozen=True)
 class Track:
@@ -24,15 +26,16 @@ class Track:
     velocity_m_s: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "2 2"]
     blob: Blob | None  # of this frame
+    part: bool = False  # of a part of a body, not of a whole one
 
-    def predicted(self, elapsed_s: float, acceleration_m_s2: float) -> Track:
-        """The track after some time without a measurement."""
+    def predicted(self, elapsed_s: float, acceleration_m2_s3: float) -> Track:
+        """The track after some time without a measurement, with white acceleration of this spectral density."""
         move = np.array([[1.0, elapsed_s], [0.0, 1.0]])
-        push = np.array([0.5 * elapsed_s**2, elapsed_s]) * acceleration_m_s2
+        push = np.array([[elapsed_s**3 / 3, elapsed_s**2 / 2], [elapsed_s**2 / 2, elapsed_s]]) * acceleration_m2_s3
         return dataclasses.replace(
             self,
             position_m=self.position_m + elapsed_s * self.velocity_m_s,
-            covariance=move @ self.covariance @ move.T + np.outer(push, push),
+            covariance=move @ self.covariance @ move.T + push,
             blob=None,
         )
 
@@ -57,9 +60,11 @@ def follow(
     elapsed_s: float,
     next_number: int,
     settings: BlobSettings,
+    *,
+    part: bool = False,
 ) -> tuple[tuple[Track, ...], int]:
-    """The tracks after a frame, and the number that the next new one gets."""
-    ahead = [track.predicted(elapsed_s, settings.acceleration_m_s2) for track in tracks]
+    """The tracks after a frame, and the number that the next new one gets. New tracks are of parts if `part` is true."""
+    ahead = [track.predicted(elapsed_s, settings.acceleration_m2_s3) for track in tracks]
     away = np.array([[np.linalg.norm(t.position_m - blob.centre_m) for blob in blobs] for t in ahead])
     away = away.reshape(len(ahead), len(blobs))
     chosen = hard_assignment(np.where(away <= settings.gate_m, -away, -np.inf))
@@ -68,9 +73,9 @@ def follow(
         for track, blob in zip(ahead, chosen, strict=True)
     ]
     kept = [track for track in after if time_s - track.seen_s <= settings.max_unseen_s]
-    start = np.diag([settings.position_m**2, 1.0])
+    start = np.diag([settings.position_m**2, _START_SPEED_M_S**2])
     for number, blob in enumerate(blobs):
         if number not in chosen:
-            kept.append(Track(next_number, time_s, time_s, blob.centre_m, np.zeros(3), start, blob))
+            kept.append(Track(next_number, time_s, time_s, blob.centre_m, np.zeros(3), start, blob, part))
             next_number += 1
     return tuple(kept), next_number

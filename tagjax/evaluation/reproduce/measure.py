@@ -117,10 +117,11 @@ class Tracing:
         for name in ("about", "paper", "counts", "variants"):  # about other recordings, or descriptions
             del suite[name]
         on_host = isinstance(self.tracer, AbstractHostTracer)
+        learned = {} if isinstance(self.tracer, AbstractHostTracer) else parameters(self.tracer)
         everything = {
             "recording": {"suite": suite, "variant": dataclasses.asdict(item.variant), "seed": item.seed},
             "name": item.name,
-            "tracer": {"settings": self.settings, "parameters": {} if on_host else parameters(self.tracer)},
+            "tracer": {"settings": self.settings, "parameters": learned},
             "clips": {} if on_host else dataclasses.asdict(self.clips),
             "scores": dataclasses.asdict(self.scores_settings),
             "frames": self.frames,
