@@ -144,7 +144,7 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
         make_tracer({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
 
 
-@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention.paper.TagAttentionLiteral"])
+@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention.literal.TagAttentionLiteral"])
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
