@@ -205,11 +205,11 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     config = dataclasses.replace(config, scores=dataclasses.replace(config.scores, min_pixels=2))
     reported: list[str] = []
     cells = run_comparison(config, tmp_path / "out", on_progress=reported.append)
-    paper, vision, goller = cells
+    published, vision, goller = cells
     assert goller.reason == "location by proximity needs several antennas"
-    assert (paper.num_recordings, vision.num_recordings) == (2, 2)  # one of each variant
-    assert paper.num_frames == vision.num_frames > 5
-    for cell in (paper, vision):
+    assert (published.num_recordings, vision.num_recordings) == (2, 2)  # one of each variant
+    assert published.num_frames == vision.num_frames > 5
+    for cell in (published, vision):
         assert cell.p_d is not None
         assert 0 <= cell.p_d <= 1
         assert cell.p_fa is None  # everything moves
@@ -220,7 +220,7 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()
     assert any("simulated" in line for line in reported)
-    assert (paper.settings, vision.settings) == ("people", None)
+    assert (published.settings, vision.settings) == (None, None)  # one setting each
     assert (vision.error_mm is None) == (vision.identification == 0)  # the error is over correctly identified frames
 
 
