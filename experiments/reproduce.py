@@ -2,7 +2,7 @@
 
 python -m experiments.reproduce table=suites               # interrupted, it resumes when it is started again
 python -m experiments.reproduce table=suites render=true   # the Markdown again, from the JSON
-python -m experiments.reproduce check=true                   # which tables are stale, and why
+python -m experiments.reproduce check=true                 # which tables are stale, and why
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from tagjax.core.settings import from_mapping
     from tagjax.sim.contact_sheet import save_preview, save_sheet
-    from tagjax.sim.link_budgets import budget_lines
     from tagjax.sim.suites import SimulateConfig, Suite, make_suite
 
     from .progress import counting_bar
@@ -38,6 +37,8 @@ def main(values: dict[str, Any], folder: Path) -> None:
         console.print(f"{suite.name}: {save_preview(suite, Path(config.sheet), workers=config.workers or 1)}")
         return
     if config.budget is not None:
+        from tagjax.sim.link_budgets import budget_lines
+
         console.print("\n".join(budget_lines(suite, config.budget)), soft_wrap=True, highlight=False)
         return
     items = suite.items()

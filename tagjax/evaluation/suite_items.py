@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from ..core.settings import ConfigError, from_mapping
 from ..recording import Recording
@@ -16,6 +16,9 @@ from ..sim.suites import PLANAR, SPLITS, Item, Suite, make_items
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SuiteSelection:
     """Recordings of one split of some suites; `suites` holds each one's settings by name, as in the files of conf/suite."""
+
+    lines_allowed: ClassVar[bool] = False
+    """Whether suites of lines of reads, without pictures, may be selected."""
 
     suites: Mapping[str, Mapping[str, Any]]
     recordings_dir: str = "recordings"
@@ -40,7 +43,7 @@ class SuiteSelection:
         """A suite's items, simulated where they are missing. Raises `ConfigError` where it has none, or no pictures."""
         suite = from_mapping(Suite, self.suites[name], where=f"suite {name}")
         suite = suite.smoke() if self.smoke else suite
-        if suite.story == PLANAR:
+        if suite.story == PLANAR and not self.lines_allowed:
             raise ConfigError(f"{suite.name} has lines of reads and no pictures; choose another suite.")
         items = make_items(
             suite,

@@ -6,7 +6,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE
@@ -15,14 +14,15 @@ from rich.text import Text
 
 from ...core.files import write_atomic
 from ...core.results import write_json
-from ...core.settings import ConfigError, from_mapping
+from ...core.settings import ConfigError
 from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
 from ...metrics.tags import Scores
 from ...recording import Recording, RecordingError
 from ...recording.store import open_recording
 from ...report.comparison import bar_plot
-from ...sim.suites import PLANAR, SPLITS, Item, Suite, make_items
+from ...sim.suites import PLANAR, Item
 from ...tracing.tracer import Trace
+from ..suite_items import SuiteSelection
 from .systems import NAMES, Systems, SystemSettings
 from .table import LEGEND, MEASURES, SHORT_HEADINGS, Cell, bars, format_value, markdown, write_cells
 
@@ -33,39 +33,26 @@ _STATIONARY_M = 0.05
 """A tag that never moves further than this from its median position is stationary."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CompareConfig:
-    """The systems and the suites; `suites` holds the settings of each suite by name, as in the files of conf/suite."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CompareConfig(SuiteSelection):
+    """The systems and the suites."""
 
-    suites: Mapping[str, Mapping[str, Any]]
+    lines_allowed = True  # their cells give the reason why nothing is compared
+
     systems: SystemSettings
     only: tuple[str, ...] = NAMES
-    recordings_dir: str = "recordings"
-    split: str = "test"
-    max_recordings: int | None = None  # of each variant; all if None
-    smoke: bool = False
-    workers: int = 1
     published: Mapping[str, Mapping[str, str]] = dataclasses.field(
         default_factory=dict
     )  # results of the papers, by suite and system
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 
     def __post_init__(self) -> None:
-        if not self.suites:
-            raise ConfigError(
-                "suites is empty; expected names of suites, for example suites=[single_static,planar_tracks]."
-            )
+        super().__post_init__()
         if unknown := sorted(set(self.only) - set(NAMES)):
             raise ConfigError(f"only: found {', '.join(unknown)}; expected some of {', '.join(NAMES)}.")
         if unknown := sorted({name for systems in self.published.values() for name in systems} - set(NAMES)):
             raise ConfigError(
                 f"published: found {', '.join(unknown)}; expected some of {', '.join(NAMES)} below each suite."
-            )
-        if self.split not in SPLITS:
-            raise ConfigError(f"split is {self.split!r}; expected one of {', '.join(SPLITS)}.")
-        if self.max_recordings is not None and self.max_recordings < 1:
-            raise ConfigError(
-                f"max_recordings is {self.max_recordings}; expected at least 1 recording of each variant."
             )
 
 
@@ -87,29 +74,13 @@ def run_comparison(
     report = on_progress or (lambda _: None)
     folder.mkdir(parents=True, exist_ok=True)
     systems, cells = Systems(config.systems, config.scores), list[Cell]()
-    for name, values in config.suites.items():
-        items = _items(config, from_mapping(Suite, values, where=f"suite {name}"), report)
+    for name in config.suites:
+        items = config.items(name, report)
         for system in config.only:
             cell = _cell(systems, system, name, items, config, report)
             cells.append(dataclasses.replace(cell, paper=config.published.get(name, {}).get(system)))
         _write(folder, cells)
     return cells
-
-
-def _items(config: CompareConfig, suite: Suite, report: Callable[[str], None]) -> list[Item]:
-    suite = suite.smoke() if config.smoke else suite
-
-    items = make_items(
-        suite,
-        Path(config.recordings_dir),
-        splits=(config.split,),
-        max_per_variant=config.max_recordings,
-        workers=config.workers,
-        on_done=lambda one: report(f"simulated {one.name}"),
-    )
-    if not items:
-        raise ConfigError(f"{suite.name} has no {config.split} recording; choose another split, or raise its counts.")
-    return items
 
 
 def _cell(

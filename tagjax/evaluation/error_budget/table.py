@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from rich.box import SIMPLE
 from rich.table import Table
-from rich.text import Text
 
 from ...core.results import markdown_table
 from ...metrics.interval import Estimate
-from ..estimate_text import estimate_text
+from ..estimate_text import console_estimates, estimate_text
 
 MEASURES = {"iou": "box IoU", "mask_j": "mask J", "identification": "identified"}
 """The scores of a budget, with their headings."""
@@ -52,12 +50,5 @@ def markdown(rows: Sequence[BudgetRow]) -> str:
 
 def console_table(rows: Sequence[BudgetRow]) -> Table:
     """The table for a terminal, with the legend below."""
-    table = Table(box=SIMPLE, show_edge=False, padding=0)
-    for name in ("suite", "tracer", "truth"):
-        table.add_column(name, no_wrap=True)
-    for name in MEASURES.values():
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(row.suite, row.tracer, row.truth, *(estimate_text(row.estimates[name]) for name in MEASURES))
-    table.caption, table.caption_justify = Text(LEGEND), "left"
-    return table
+    labelled = (((row.suite, row.tracer, row.truth), row.estimates) for row in rows)
+    return console_estimates(("suite", "tracer", "truth"), MEASURES, labelled, LEGEND)

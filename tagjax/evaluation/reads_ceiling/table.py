@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from rich.box import SIMPLE
 from rich.table import Table
-from rich.text import Text
 
 from ...core.results import markdown_table
 from ...metrics.interval import Estimate
 from ...metrics.tags import CLEAR, CLEAR_LINE_OF_SIGHT, CLEAR_READS
-from ..estimate_text import estimate_text
+from ..estimate_text import console_estimates, estimate_text
 from .candidates import Memory
 
 HEADINGS = {
@@ -107,13 +105,5 @@ def _number(value: float | None, digits: int) -> str:
 
 def console_table(rows: Sequence[Row]) -> Table:
     """The table of suites for a terminal, with the legend below."""
-    table = Table(box=SIMPLE, show_edge=False, padding=0)
-    for name in ("suite", "memory", "offsets"):
-        table.add_column(name, no_wrap=True)
-    for name in HEADINGS.values():
-        table.add_column(name, justify="right")
-    for row in rows:
-        values = (estimate_text(row.estimates[name]) for name in HEADINGS)
-        table.add_row(row.suite, row.memory.seconds_text, row.memory.offsets_text, *values)
-    table.caption, table.caption_justify = Text(LEGEND), "left"
-    return table
+    labelled = (((row.suite, row.memory.seconds_text, row.memory.offsets_text), row.estimates) for row in rows)
+    return console_estimates(("suite", "memory", "offsets"), HEADINGS, labelled, LEGEND)
