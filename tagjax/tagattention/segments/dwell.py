@@ -1,0 +1,148 @@
+"""Dwell evidence: how well each segment's motion explains each tag's raw phases, every read counted once.
+
+The likelihood of a dwell's reads depends on one phasor a (tag, antenna, segment); see `radio.reader_model` for the
+equations. Phasors are relative to the segment's distance at the dwell's first read. So a read touches one row of segments,
+and a frame without reads touches no phasor: only the distances, which all tags share, are summed every frame.
+
+Evidence is the log likelihood ratio to phases at random, in nats; that of several antennas adds up. Slot 0 is the static
+background: a tag that stays in place.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...core.constrained import Positive
+from ...radio.arrivals import Arrivals
+from ...radio.phase import distance_to_phase
+from ...radio.reader_model import ReaderModel
+
+_SHORTEST_FRAME_S = 1e-6
+
+_Rows = tuple[Array, Array, Array]
+
+
+class DwellState(eqx.Module):
+    """What the reads so far amount to, for the tags at each segment."""
+
+    real: Float[Array, "tag antenna segment"]  # phasor, relative to the dwell's first read
+    imaginary: Float[Array, "tag antenna segment"]
+    began_m: Float[Array, "tag antenna segment"]  # `distance_m` at the dwell's first read
+    distance_m: Float[Array, "antenna segment"]  # sum of the increments, inherited by newborn segments
+    channel: Int[Array, "tag antenna"]  # of the present dwell; -1 before the first read
+    log_likelihood: Float[Array, "tag segment"]  # decayed sum over reads, nats
+
+    @staticmethod
+    def nothing(num_tags: int, num_antennas: int, num_segments: int) -> DwellState:
+        """Before the first read."""
+        rows = (num_tags, num_antennas, num_segments)
+        return DwellState(
+            real=jnp.zeros(rows),
+            imaginary=jnp.zeros(rows),
+            began_m=jnp.zeros(rows),
+            distance_m=jnp.zeros(rows[1:]),
+            channel=jnp.full(rows[:2], -1, jnp.int32),
+            log_likelihood=jnp.zeros((num_tags, num_segments)),
+        )
+
+    @property
+    def moved_m(self) -> Float[Array, "tag antenna segment"]:
+        """Distance moved since the dwell's first read."""
+        return self.distance_m[None] - self.began_m
+
+
+class DwellEvidence(eqx.Module):
+    """Evidence of the reads for each (tag, segment), forgotten with a time constant."""
+
+    memory_s: Positive  # evidence decays as exp(-age / memory); scores change little from 2 to 6 s
+
+    def __init__(self, *, memory_s: float = 4.0) -> None:
+        """Raises `ValueError` for a memory that is not positive."""
+        self.memory_s = Positive(memory_s)
+
+    def step(
+        self,
+        reader: ReaderModel,
+        state: DwellState,
+        arrivals: Arrivals,
+        increment_m: Float[Array, "antenna segment"],
+        newborn_source: Int[Array, " segment"],
+        since_s: Float[Array, ""],
+        now_s: Float[Array, ""],
+    ) -> tuple[DwellState, Float[Array, "tag segment"]]:
+        """The state after the frame at `now_s`, and the evidence in nats.
+
+        `arrivals` are the reads in (since_s, now_s], in order of time; `increment_m` is what each segment's distance to
+        each antenna has grown since the frame at `since_s`, linearly in time. `newborn_source` is -2 for a segment that
+        goes on; a newborn one inherits evidence and phasors of this slot as it was at the last frame, -1 those of slot 0.
+        Cost: reads x segments, and one copy of the state for the newborn segments.
+        """
+        state = _inherit(state, newborn_source)
+        moving = jnp.arange(increment_m.shape[1]) > 0
+        increment_m = jnp.where(moving, increment_m, 0.0)
+        last_m = state.distance_m
+        memory_s = self.memory_s.value
+        decay = jnp.exp(-(now_s - since_s) / memory_s)
+        fraction = jnp.clip((arrivals.time_s - since_s) / jnp.maximum(now_s - since_s, _SHORTEST_FRAME_S), 0.0, 1.0)
+        fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / memory_s)
+
+        def updated(rows: _Rows, read: Arrivals, part: Array, goes_on: Array) -> tuple[Array, _Rows]:
+            """The evidence of a read for every segment, and the rows of its tag and antenna after it."""
+            distance_m = last_m[read.antenna] + part * increment_m[read.antenna]
+            real, imaginary = (jnp.where(goes_on, row, 0.0) for row in rows[:2])
+            began_m = jnp.where(goes_on, rows[2], distance_m)
+            moved_m = distance_m - began_m
+            concentration = reader.concentration(read.rssi_dbm, read.carrier_hz, moved_m, ~moving)
+            residual_rad = read.phase_rad - distance_to_phase(moved_m, read.carrier_hz)
+            evidence, real, imaginary = reader.add_read(real, imaginary, concentration, residual_rad)
+            return evidence, (real, imaginary, began_m)
+
+        def add(carry: tuple[_Rows, Array, Array], one: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
+            tables, channel, log_likelihood = carry
+            read, part, weight = one
+            at = read.tag * num_antennas + read.antenna
+            rows = tuple(jax.lax.dynamic_index_in_dim(table, at, keepdims=False) for table in tables)
+            evidence, rows = jax.lax.cond(
+                read.valid,
+                lambda rows: updated(rows, read, part, read.channel == channel[at]),
+                lambda rows: (jnp.zeros_like(rows[0]), rows),
+                rows,
+            )
+            own = jax.lax.dynamic_index_in_dim(log_likelihood, read.tag, keepdims=False) + weight * evidence
+            return (
+                tuple(jax.lax.dynamic_update_index_in_dim(t, row, at, 0) for t, row in zip(tables, rows, strict=True)),
+                channel.at[at].set(jnp.where(read.valid, read.channel, channel[at])),
+                jax.lax.dynamic_update_index_in_dim(log_likelihood, own, read.tag, 0),
+            ), None
+
+        num_antennas, shape = increment_m.shape[0], state.real.shape
+        tables = tuple(table.reshape(-1, shape[-1]) for table in (state.real, state.imaginary, state.began_m))
+        carry = (tables, state.channel.reshape(-1), decay * state.log_likelihood)
+        (tables, channel, log_likelihood), _ = jax.lax.scan(add, carry, (arrivals, fraction, fresh))
+        real, imaginary, began_m = (table.reshape(shape) for table in tables)
+        distance_m = last_m + increment_m
+        after = DwellState(real, imaginary, began_m, distance_m, channel.reshape(shape[:2]), log_likelihood)
+        return after, log_likelihood
+
+
+def _inherit(state: DwellState, newborn_source: Int[Array, " segment"]) -> DwellState:
+    """The state with newborn segments' rows from their sources, all at once: a source may be replaced itself."""
+    slot = jnp.arange(newborn_source.shape[0], dtype=newborn_source.dtype)
+    source = jnp.where((newborn_source < -1) | (slot == 0), slot, jnp.maximum(newborn_source, 0))
+
+    def of(rows: Float[Array, "*batch segment"]) -> Float[Array, "*batch segment"]:
+        return jnp.take(rows, source, axis=-1, mode="clip")
+
+    return DwellState(
+        real=of(state.real),
+        imaginary=of(state.imaginary),
+        began_m=of(state.began_m),
+        distance_m=of(state.distance_m),
+        channel=state.channel,
+        log_likelihood=of(state.log_likelihood),
+    )

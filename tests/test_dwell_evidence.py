@@ -1,0 +1,374 @@
+"""Dwell evidence of segments against a NumPy twin in complex float64, closed forms, and today's phase evidence of pixels."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+from tagjax.radio.arrivals import Arrivals
+from tagjax.radio.noise import thermal_sigma_rad
+from tagjax.radio.reader_model import ReaderModel
+from tagjax.radio.reads import PhaseReads
+from tagjax.tagattention.phases import PhaseNoise, Phasor, explain, fresh_reads
+from tagjax.tagattention.segments.dwell import DwellEvidence, DwellState
+
+C = 299_792_458.0
+FRAME_S = 1 / 30
+NUM_SEGMENTS = 20
+NO_NEWBORN = jnp.full(NUM_SEGMENTS, -2, jnp.int32)
+NEVER_FORGOTTEN = DwellEvidence(memory_s=1e12)
+
+
+@jax.jit
+def _step(evidence, reader, state, arrivals, increment_m, newborn_source, since_s, now_s):
+    return evidence.step(reader, state, arrivals, increment_m, newborn_source, since_s, now_s)
+
+
+def _log_i0(x):
+    return np.log(special.ive(0, x)) + np.abs(x)
+
+
+class Twin:
+    """The same likelihood in float64 with complex phasors of absolute distances, read by read and slot by slot."""
+
+    def __init__(self, num_tags, num_antennas, num_segments, reader: ReaderModel, memory_s: float):
+        rows = (num_tags, num_antennas, num_segments)
+        self.phasor, self.began, self.distance = np.zeros(rows, complex), np.zeros(rows), np.zeros(rows[1:])
+        self.evidence, self.channel = np.zeros((num_tags, num_segments)), np.full(rows[:2], -1)
+        self.reader, self.memory_s = reader, memory_s
+
+    def step(self, reads, increment, source, since, now):
+        old = [part.copy() for part in (self.phasor, self.began, self.distance, self.evidence)]
+        for slot, one in enumerate(source):
+            if one > -2:
+                for part, before in zip((self.phasor, self.began, self.distance, self.evidence), old, strict=True):
+                    part[..., slot] = before[..., max(one, 0)]
+        increment = np.where(np.arange(increment.shape[1]) == 0, 0.0, increment)
+        self.evidence *= np.exp(-(now - since) / self.memory_s)
+        m, q = (2 if self.reader.modulo_pi else 1), float(self.reader.outlier.value)
+        for tag, antenna, time_s, phase, carrier, channel, rssi in reads:
+            at = self.distance[antenna] + (time_s - since) / (now - since) * increment[antenna]
+            wave = 4 * np.pi * carrier / C
+            if channel != self.channel[tag, antenna]:
+                self.phasor[tag, antenna], self.began[tag, antenna] = 0, at
+                self.channel[tag, antenna] = channel
+            spread = np.full(len(at), float(self.reader.spread_rad.value))
+            spread[0] = float(self.reader.still_spread_rad.value)
+            slack = float(self.reader.slack.value) * wave * (at - self.began[tag, antenna])
+            weight = 1 / (m**2 * (thermal_sigma_rad(np.array([float(rssi)])) ** 2 + spread**2 + slack**2))
+            own, before = weight * np.exp(1j * m * (phase - wave * at)), self.phasor[tag, antenna]
+            gain = _log_i0(np.abs(before + own)) - _log_i0(np.abs(before)) - _log_i0(weight)
+            each = np.logaddexp(np.log1p(-q) + gain, np.log(q))
+            self.phasor[tag, antenna] = before + own * np.exp(np.log1p(-q) + gain - each)
+            self.evidence[tag] += each * np.exp(-(now - time_s) / self.memory_s)
+        self.distance += increment
+        return self.evidence
+
+
+def _arrivals(reads, length: int = 16, dtype=jnp.float32) -> Arrivals:
+    """A buffer of (tag, antenna, time_s, phase_rad, carrier_hz, channel, rssi_dbm)."""
+    columns = list(zip(*reads, strict=True)) if reads else [()] * 7
+    names = ("tag", "antenna", "time_s", "phase_rad", "carrier_hz", "channel", "rssi_dbm")
+    fills = (0, 0, 0.0, 0.0, 915e6, -1, -60.0)
+    made = {}
+    for name, column, fill in zip(names, columns, fills, strict=True):
+        kind = jnp.int32 if name in ("tag", "antenna", "channel") else dtype
+        made[name] = jnp.asarray([*column, *[fill] * (length - len(reads))], kind)
+    return Arrivals(**made, valid=jnp.arange(length) < len(reads))
+
+
+def _frames(rng, num_frames=10, num_reads=10, num_tags=3, num_antennas=2):
+    """Reads, increments and newborn slots of some frames, in numbers that float32 has."""
+    frames, alive = [], 2.0 + rng.uniform(0, 1, num_antennas)
+    speed = rng.normal(0, 0.01, (num_antennas, NUM_SEGMENTS))
+    for frame in range(num_frames):
+        since, now = np.float32(frame * FRAME_S), np.float32((frame + 1) * FRAME_S)
+        reads = []
+        for time_s in np.sort(rng.uniform(since + 1e-4, now, num_reads)):
+            tag, antenna, channel = rng.integers(num_tags), rng.integers(num_antennas), (frame // 4) * 3
+            carrier = np.float32(902.75e6 + 5e5 * channel)
+            distance = alive[antenna] + speed[antenna, 1 + tag] * time_s / FRAME_S
+            phase = np.mod(4 * np.pi * carrier * distance / C + 1.3 * channel + rng.normal(0, 0.1), 2 * np.pi)
+            rssi = np.float32(rng.uniform(-70, -50))
+            reads.append((tag, antenna, float(np.float32(time_s)), float(np.float32(phase)), carrier, channel, rssi))
+        source = np.full(NUM_SEGMENTS, -2)
+        if frame:
+            slots = rng.choice(np.arange(1, NUM_SEGMENTS), 4, replace=False)
+            source[slots] = [-1, slots[0], slots[3], rng.integers(1, NUM_SEGMENTS)]  # sources that are newborn, too
+        increment = (speed + rng.normal(0, 0.002, speed.shape)).astype(np.float32)
+        frames.append((reads, increment, source, since, now))
+    return frames
+
+
+def _run(frames, evidence, reader, num_tags=3, num_antennas=2, **buffer):
+    state, outs = DwellState.nothing(num_tags, num_antennas, NUM_SEGMENTS), []
+    for reads, increment, source, since, now in frames:
+        state, out = _step(
+            evidence, reader, state, _arrivals(reads, **buffer), jnp.asarray(increment),
+            jnp.asarray(source, jnp.int32), jnp.asarray(since), jnp.asarray(now),
+        )  # fmt: skip
+        outs.append(out)
+    return state, np.stack(outs)
+
+
+@pytest.mark.parametrize("modulo_pi", [True, False])
+def test_the_evidence_is_the_twins(modulo_pi):
+    frames, reader = _frames(np.random.default_rng(0)), ReaderModel(modulo_pi=modulo_pi)
+    assert sum(len(frame[0]) for frame in frames) == 100
+    evidence = DwellEvidence(memory_s=0.5)
+    twin = Twin(3, 2, NUM_SEGMENTS, reader, float(evidence.memory_s.value))
+    expected = np.stack([twin.step(*frame).copy() for frame in frames])
+    state, ours = _run(frames, evidence, reader)
+    assert np.ptp(expected[-1]) > 10  # the segments differ in what they explain
+    np.testing.assert_allclose(ours, expected, atol=1e-4)
+    np.testing.assert_allclose(state.moved_m, twin.distance[None] - twin.began, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(state.real, state.imaginary), np.abs(twin.phasor), rtol=1e-5)
+
+
+def test_a_dwell_without_outliers_has_the_closed_form():
+    """log I0(|S|) - sum log I0(w), for 30 reads of one tag on one carrier, of segments at constant speeds."""
+    rng = np.random.default_rng(1)
+    speed = np.concatenate([[0.0], rng.uniform(-0.5, 0.5, NUM_SEGMENTS - 1)])
+    time_s = np.sort(rng.uniform(1e-3, 5 * FRAME_S, 30)).astype(np.float32)
+    phase = np.mod(4 * np.pi * 915e6 * speed[1] * time_s / C + rng.normal(0, 0.1, 30) + 1, 2 * np.pi)
+    frames = []
+    for frame in range(5):
+        since, now = np.float32(frame * FRAME_S), np.float32((frame + 1) * FRAME_S)
+        chosen = np.flatnonzero((time_s > since) & (time_s <= now))
+        reads = [(0, 0, float(time_s[i]), phase[i], 915e6, 7, -55.0) for i in chosen]
+        frames.append((reads, (speed[None] * FRAME_S).astype(np.float32), np.full(NUM_SEGMENTS, -2), since, now))
+    reader = ReaderModel(outlier=1e-12)
+    ours = _run(frames, NEVER_FORGOTTEN, reader, num_tags=1, num_antennas=1)[1][-1, 0]
+    moved = speed[:, None] * (time_s - time_s[0])[None].astype(float)
+    wave = 4 * np.pi * 915e6 / C
+    spread = np.where(np.arange(NUM_SEGMENTS) == 0, 0.03, 0.064)[:, None]
+    weight = 1 / (4 * (thermal_sigma_rad(np.array([-55.0])) ** 2 + spread**2 + (0.2 * wave * moved) ** 2))
+    phasor = np.sum(weight * np.exp(2j * (phase - wave * moved)), axis=1)
+    expected = _log_i0(np.abs(phasor)) - np.sum(_log_i0(weight), axis=1)
+    explained = expected > -25  # of a read that fits worse than the outliers' 1e-12 the mixture counts no more
+    assert 3 < explained.sum() < NUM_SEGMENTS
+    assert ours[1] > 30
+    np.testing.assert_allclose(ours[explained], expected[explained], atol=2e-4)
+
+
+def _still(phase_rad, spacing_s: float = 0.01, **row):
+    """Reads of tag 0 with these phases, and the time of the last."""
+    made = {"tag": 0, "antenna": 0, "carrier": 915e6, "channel": 0, "rssi": -55.0, **row}
+    names = ("carrier", "channel", "rssi")
+    return [
+        (made["tag"], made["antenna"], spacing_s * (i + 1), phase, *(made[name] for name in names))
+        for i, phase in enumerate(phase_rad)
+    ]
+
+
+def _once(reads, reader=None, evidence=NEVER_FORGOTTEN, increment_m=None, now_s=0.2, state=None, **buffer):
+    increment_m = jnp.zeros((2, NUM_SEGMENTS)) if increment_m is None else increment_m
+    state = DwellState.nothing(3, 2, NUM_SEGMENTS) if state is None else state
+    reader = ReaderModel() if reader is None else reader
+    return _step(
+        evidence, reader, state, _arrivals(reads, **buffer), increment_m, NO_NEWBORN,
+        jnp.asarray(0.0), jnp.asarray(now_s),
+    )  # fmt: skip
+
+
+def test_a_wrong_read_costs_at_most_an_outlier_and_leaves_the_phasor():
+    before, clean = _once(_still([1.0] * 10))
+    after, found = _once(_still([1.0] * 10 + [1.0 + np.pi / 2]))
+    np.testing.assert_allclose(found[0] - clean[0], np.log(0.04), atol=1e-3)
+    np.testing.assert_allclose(after.real, before.real, rtol=1e-6)
+    np.testing.assert_allclose(after.imaginary, before.imaginary, rtol=1e-6)
+
+
+def test_with_outliers_alone_reads_are_no_evidence():
+    _, found = _once(_still([1.0, 2.0, 0.5, 0.5]), ReaderModel(outlier=1 - 1e-6))
+    np.testing.assert_allclose(found, 0.0, atol=1e-4)
+
+
+def test_the_first_read_of_a_dwell_is_no_evidence():
+    np.testing.assert_allclose(_once(_still([1.0]))[1], 0.0, atol=3e-5)
+    state, one = _once(_still([1.0, 1.0, 1.0]))
+    _, two = _once(_still([1.0, 1.0, 1.0]) + [(0, 0, 0.1, 2.5, 902.75e6, 4, -55.0)])
+    np.testing.assert_allclose(two, one, atol=3e-5)  # another carrier, another offset
+    assert state.channel.tolist() == [[0, -1], [-1, -1], [-1, -1]]
+
+
+def test_the_order_of_reads_of_different_tags_does_not_matter():
+    frames, reader = _frames(np.random.default_rng(2)), ReaderModel()
+    by_tag = [(sorted(reads, key=lambda read: read[:2]), *rest) for reads, *rest in frames]
+    assert by_tag[0][0] != frames[0][0]
+    one, other = (_run(each, DwellEvidence(), reader) for each in (frames, by_tag))
+    np.testing.assert_allclose(one[1], other[1], atol=2e-5)
+
+
+def test_padding_does_not_matter():
+    frames, reader = _frames(np.random.default_rng(3)), ReaderModel()
+    short, long = (_run(frames, DwellEvidence(), reader, length=length) for length in (10, 23))
+    for ours, other in zip(jax.tree.leaves(short), jax.tree.leaves(long), strict=True):
+        np.testing.assert_array_equal(ours, other)
+
+
+def test_evidence_of_two_antennas_adds_up():
+    first, second = _still([1.0, 1.1, 0.9]), _still([2.0, 2.1, 1.9, 2.4], antenna=1)
+    both = _once(sorted(first + second, key=lambda read: read[2]))[1]
+    np.testing.assert_allclose(both, _once(first)[1] + _once(second)[1], atol=1e-5)
+    assert float(both[0, 1]) > 3
+    assert not np.any(np.asarray(both[1:]))  # other tags have no read
+
+
+def test_the_background_stays_in_place():
+    moving = jnp.full((2, NUM_SEGMENTS), 0.1)
+    state, found = _once(_still([1.0] * 10), increment_m=moving, evidence=NEVER_FORGOTTEN)
+    exact = _once(_still([1.0] * 10), ReaderModel(spread_rad=0.03), increment_m=jnp.zeros_like(moving))[1]
+    assert float(found[0, 0]) == pytest.approx(float(exact[0, 1]), abs=1e-4)
+    assert float(state.distance_m[0, 0]) == 0.0
+    np.testing.assert_allclose(state.distance_m[:, 1:], 0.1)
+    assert float(found[0, 0]) > float(found[0, 1]) + 5
+
+
+def test_newborn_segments_inherit_from_the_last_frame():
+    rng = np.random.default_rng(4)
+    state = jax.tree.map(
+        lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), DwellState.nothing(3, 2, NUM_SEGMENTS)
+    )
+    state = eqx.tree_at(lambda s: s.channel, state, jnp.zeros((3, 2), jnp.int32))
+    source = np.full(NUM_SEGMENTS, -2)
+    source[[3, 4, 5, 0]] = [7, 3, -1, 9]
+    after, found = _step(
+        NEVER_FORGOTTEN, ReaderModel(), state, _arrivals([]), jnp.zeros((2, NUM_SEGMENTS)),
+        jnp.asarray(source, jnp.int32), jnp.asarray(1.0), jnp.asarray(1.03),
+    )  # fmt: skip
+    slots = np.arange(NUM_SEGMENTS)
+    slots[[3, 4, 5]] = [7, 3, 0]  # 4 has what 3 was; 0 is never newborn
+    for name in ("real", "imaginary", "began_m", "distance_m", "log_likelihood"):
+        np.testing.assert_allclose(getattr(after, name), np.asarray(getattr(state, name))[..., slots], rtol=1e-6)
+    np.testing.assert_array_equal(found, after.log_likelihood)
+
+
+def test_evidence_decays_by_its_age():
+    forgetful = DwellEvidence(memory_s=4.0)
+    reads = _still([1.0, 1.0])
+    kept, faded = _once(reads)[1], _once(reads, evidence=forgetful, now_s=2.02)[1]
+    np.testing.assert_allclose(faded, kept * np.exp(-2.0 / 4.0), rtol=1e-5, atol=1e-6)  # the second read is of 0.02 s
+    state, now = _once(reads, evidence=forgetful)
+    later, _ = _step(
+        forgetful, ReaderModel(), state, _arrivals([]), jnp.zeros((2, NUM_SEGMENTS)), NO_NEWBORN,
+        jnp.asarray(0.2), jnp.asarray(1.2),
+    )  # fmt: skip
+    np.testing.assert_allclose(later.log_likelihood, now * np.exp(-1.0 / 4.0), rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(later.real, state.real)  # phasors are not forgotten
+
+
+def test_the_frame_rate_does_not_matter():
+    """The same reads in one frame or in ten, at constant speeds."""
+    rng, evidence, reader = np.random.default_rng(5), DwellEvidence(memory_s=0.3), ReaderModel()
+    speed = rng.uniform(-0.3, 0.3, (2, NUM_SEGMENTS)).astype(np.float32)
+    reads = _still(np.mod(rng.normal(1, 0.3, 12), 2 * np.pi), spacing_s=0.015)
+    _, at_once = _once(reads, reader, evidence, increment_m=jnp.asarray(speed * np.float32(0.2)))
+    frames = []
+    for frame in range(10):
+        since, now = np.float32(0.02 * frame), np.float32(0.02 * (frame + 1))
+        own = [read for read in reads if since < read[2] <= now]
+        frames.append((own, speed * np.float32(0.02), np.full(NUM_SEGMENTS, -2), since, now))
+    np.testing.assert_allclose(_run(frames, evidence, reader)[1][-1], at_once, atol=2e-4)
+
+
+@pytest.mark.parametrize(("num_reads", "outlier"), [(1, 0.05), (5, 1e-7)])
+@pytest.mark.parametrize("modulo_pi", [True, False])
+def test_one_segment_has_the_evidence_of_explain(num_reads, outlier, modulo_pi):
+    """`explain` takes a frame's reads for no outliers of each other: one a frame agrees, several without outliers do."""
+    rng, reader = np.random.default_rng(6), ReaderModel(outlier=outlier, modulo_pi=modulo_pi)
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), reader)
+        noise = PhaseNoise(wide.spread_rad.value**2, wide.slack.value, wide.outlier.value)
+        evidence = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), NEVER_FORGOTTEN)
+        state, phasor, channel = DwellState.nothing(1, 1, 2), Phasor.nothing(()), jnp.asarray(-1, jnp.int32)
+        total, distance = 0.0, 0.0
+        for frame in range(8):
+            since, now = frame * FRAME_S, (frame + 1) * FRAME_S
+            time_s = np.sort(rng.uniform(since + 1e-4, now, num_reads))
+            hop, increment = (time_s > 4.5 * FRAME_S).astype(int), rng.normal(0, 0.01)
+            carrier = 902.75e6 + 5e5 * hop
+            phase = 4 * np.pi * carrier * (distance + increment * (time_s - since) / FRAME_S) / C + 1.1 * hop
+            phase = np.mod(phase + rng.normal(0, 0.1, num_reads), 2 * np.pi)
+            distance += increment
+            rssi = rng.uniform(-70, -50, num_reads)
+            buffer = PhaseReads(
+                *(jnp.asarray(column) for column in (time_s, phase, carrier, thermal_sigma_rad(rssi))),
+                channel=jnp.asarray(hop, jnp.int32),
+                valid=jnp.ones(num_reads, bool),
+            )
+            fresh = fresh_reads(buffer, channel, jnp.asarray(since), jnp.asarray(now))
+            found, phasor = explain(phasor, jnp.asarray(increment), fresh, noise, doubled_angle=modulo_pi)
+            total, channel = total + float(found), fresh.channel
+            reads = [(0, 0, *row) for row in zip(time_s, phase, carrier, hop, rssi, strict=True)]
+            state, ours = _step(
+                evidence, wide, state, _arrivals(reads, 5, jnp.float64), jnp.asarray([[0.0, increment]]),
+                jnp.full(2, -2, jnp.int32), jnp.asarray(since), jnp.asarray(now),
+            )  # fmt: skip
+            assert float(ours[0, 1]) == pytest.approx(total, abs=1e-4)
+            assert float(state.moved_m[0, 0, 1]) == pytest.approx(float(phasor.moved_m), abs=1e-9)
+    assert abs(total) > 5
+
+
+def test_jit_is_eager_and_vmap_is_a_loop():
+    (reads, increment, source, since, now), *_ = _frames(np.random.default_rng(7))
+    evidence, reader, state = DwellEvidence(), ReaderModel(), DwellState.nothing(3, 2, NUM_SEGMENTS)
+    rest = jnp.asarray(source, jnp.int32), jnp.asarray(since), jnp.asarray(now)
+    steps = jnp.stack([jnp.asarray(increment), -jnp.asarray(increment)])
+    eager = [evidence.step(reader, state, _arrivals(reads), step, *rest) for step in steps]
+    compiled = [_step(evidence, reader, state, _arrivals(reads), step, *rest) for step in steps]
+    mapped = jax.vmap(lambda step: evidence.step(reader, state, _arrivals(reads), step, *rest))(steps)
+    mapped = [jax.tree.map(lambda leaf, i=i: leaf[i], mapped) for i in range(2)]
+    for other in (compiled, mapped):
+        for ours, theirs in zip(jax.tree.leaves(eager), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_are_those_of_finite_differences():
+    """Through three frames with newborn segments, for increments and all parameters of reader and memory."""
+    frames = _frames(np.random.default_rng(8), num_frames=3, num_reads=6)
+    with jax.enable_x64(True):
+        models = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (DwellEvidence(memory_s=0.2), ReaderModel()))
+        increments = jnp.asarray(np.stack([frame[1] for frame in frames]), jnp.float64)
+        chosen = jnp.asarray(np.random.default_rng(9).normal(size=(3, NUM_SEGMENTS)))
+
+        @jax.jit
+        def score(models, increments):
+            evidence, reader = models
+            state, total = DwellState.nothing(3, 2, NUM_SEGMENTS), 0.0
+            for (reads, _, source, since, now), increment in zip(frames, increments, strict=True):
+                state, found = evidence.step(
+                    reader, state, _arrivals(reads, 8, jnp.float64), increment, jnp.asarray(source, jnp.int32),
+                    jnp.asarray(since, jnp.float64), jnp.asarray(now, jnp.float64),
+                )  # fmt: skip
+                total = total + jnp.sum(chosen * found)
+            return total
+
+        gradient = jax.jit(jax.grad(score, argnums=(0, 1)))(models, increments)
+        leaves, tree = jax.tree.flatten((models, increments))
+        h = 1e-6
+        for i, (leaf, ours) in enumerate(zip(leaves, jax.tree.leaves(gradient), strict=True)):
+            assert np.any(ours != 0), i  # every parameter matters
+            for at in [()] if leaf.ndim == 0 else [(0, 0, 1), (0, 1, 7), (1, 0, 2), (2, 1, 3), (1, 1, 0)]:
+                ends = [score(*tree.unflatten([*leaves[:i], leaf.at[at].add(s * h), *leaves[i + 1 :]])) for s in (1, -1)]
+                change = float(ends[0] - ends[1]) / (2 * h)
+                assert float(ours[at]) == pytest.approx(change, rel=1e-5, abs=1e-6), (i, at)
+        assert float(gradient[1][1, 1, 0]) == 0.0  # the background does not move
+
+
+@pytest.mark.parametrize("reads", [[], _still([1.0]), _still([1.0, 1.0]), _still([1.0, 1.0 + np.pi / 2])])
+def test_gradients_are_finite_from_nothing(reads):
+    def score(models, state, increment):
+        after, found = models[0].step(
+            models[1], state, _arrivals(reads), increment, NO_NEWBORN, jnp.asarray(0.0), jnp.asarray(0.0)
+        )
+        return jnp.sum(found) + jnp.sum(after.real + after.imaginary) + jnp.sum(after.moved_m)
+
+    gradient = eqx.filter_grad(lambda args: score(*args))(
+        ((DwellEvidence(), ReaderModel()), DwellState.nothing(3, 2, NUM_SEGMENTS), jnp.zeros((2, NUM_SEGMENTS)))
+    )
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
