@@ -124,7 +124,8 @@ def test_the_evidence_is_the_twins(modulo_pi):
     expected = np.stack([twin.step(*frame).copy() for frame in frames])
     state, ours = _run(frames, evidence, reader)
     assert np.ptp(expected[-1]) > 10  # the segments differ in what they explain
-    np.testing.assert_allclose(ours, expected, atol=1e-4)
+    # Modulo 2 pi concentrations are four times as large, and so is what float32 makes of an angle.
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-4 if modulo_pi else 4e-4)
     np.testing.assert_allclose(state.moved_m, twin.distance[None] - twin.began, atol=1e-6)
     np.testing.assert_allclose(np.hypot(state.real, state.imaginary), np.abs(twin.phasor), rtol=1e-5)
 
@@ -191,7 +192,7 @@ def test_with_outliers_alone_reads_are_no_evidence():
 def test_the_first_read_of_a_dwell_is_no_evidence():
     np.testing.assert_allclose(_once(_still([1.0]))[1], 0.0, atol=3e-5)
     state, one = _once(_still([1.0, 1.0, 1.0]))
-    _, two = _once(_still([1.0, 1.0, 1.0]) + [(0, 0, 0.1, 2.5, 902.75e6, 4, -55.0)])
+    _, two = _once([*_still([1.0, 1.0, 1.0]), (0, 0, 0.1, 2.5, 902.75e6, 4, -55.0)])
     np.testing.assert_allclose(two, one, atol=3e-5)  # another carrier, another offset
     assert state.channel.tolist() == [[0, -1], [-1, -1], [-1, -1]]
 
@@ -334,19 +335,24 @@ def test_gradients_are_those_of_finite_differences():
     with jax.enable_x64(True):
         models = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (DwellEvidence(memory_s=0.2), ReaderModel()))
         increments = jnp.asarray(np.stack([frame[1] for frame in frames]), jnp.float64)
-        chosen = jnp.asarray(np.random.default_rng(9).normal(size=(3, NUM_SEGMENTS)))
+        chosen = jnp.asarray(np.random.default_rng(9).normal(size=(3, 3, NUM_SEGMENTS)))
+        arrivals = [_arrivals(reads, 8, jnp.float64) for reads, *_ in frames]
+        given = (
+            jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrivals),
+            jnp.asarray(np.stack([source for _, _, source, _, _ in frames]), jnp.int32),
+            *(jnp.asarray([frame[i] for frame in frames], jnp.float64) for i in (3, 4)),
+        )
 
         @jax.jit
         def score(models, increments):
             evidence, reader = models
-            state, total = DwellState.nothing(3, 2, NUM_SEGMENTS), 0.0
-            for (reads, _, source, since, now), increment in zip(frames, increments, strict=True):
-                state, found = evidence.step(
-                    reader, state, _arrivals(reads, 8, jnp.float64), increment, jnp.asarray(source, jnp.int32),
-                    jnp.asarray(since, jnp.float64), jnp.asarray(now, jnp.float64),
-                )  # fmt: skip
-                total = total + jnp.sum(chosen * found)
-            return total
+
+            def frame(state, each):
+                (reads, source, since, now), increment = each
+                return evidence.step(reader, state, reads, increment, source, since, now)
+
+            found = jax.lax.scan(frame, DwellState.nothing(3, 2, NUM_SEGMENTS), (given, increments))[1]
+            return jnp.sum(chosen * found)
 
         gradient = jax.jit(jax.grad(score, argnums=(0, 1)))(models, increments)
         leaves, tree = jax.tree.flatten((models, increments))
@@ -354,21 +360,32 @@ def test_gradients_are_those_of_finite_differences():
         for i, (leaf, ours) in enumerate(zip(leaves, jax.tree.leaves(gradient), strict=True)):
             assert np.any(ours != 0), i  # every parameter matters
             for at in [()] if leaf.ndim == 0 else [(0, 0, 1), (0, 1, 7), (1, 0, 2), (2, 1, 3), (1, 1, 0)]:
-                ends = [score(*tree.unflatten([*leaves[:i], leaf.at[at].add(s * h), *leaves[i + 1 :]])) for s in (1, -1)]
+                ends = [
+                    score(*tree.unflatten([*leaves[:i], leaf.at[at].add(s * h), *leaves[i + 1 :]])) for s in (1, -1)
+                ]
                 change = float(ends[0] - ends[1]) / (2 * h)
                 assert float(ours[at]) == pytest.approx(change, rel=1e-5, abs=1e-6), (i, at)
         assert float(gradient[1][1, 1, 0]) == 0.0  # the background does not move
 
 
-@pytest.mark.parametrize("reads", [[], _still([1.0]), _still([1.0, 1.0]), _still([1.0, 1.0 + np.pi / 2])])
-def test_gradients_are_finite_from_nothing(reads):
-    def score(models, state, increment):
-        after, found = models[0].step(
-            models[1], state, _arrivals(reads), increment, NO_NEWBORN, jnp.asarray(0.0), jnp.asarray(0.0)
-        )
-        return jnp.sum(found) + jnp.sum(after.real + after.imaginary) + jnp.sum(after.moved_m)
+def test_gradients_are_finite_from_nothing():
+    """Without reads, at phasors of zero, between frames of the same time, and where a second phase is opposite."""
 
-    gradient = eqx.filter_grad(lambda args: score(*args))(
-        ((DwellEvidence(), ReaderModel()), DwellState.nothing(3, 2, NUM_SEGMENTS), jnp.zeros((2, NUM_SEGMENTS)))
-    )
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    @jax.jit
+    def gradient(arrivals):
+        def score(models, state, increment):
+            evidence, reader = models
+            after, found = evidence.step(
+                reader, state, arrivals, increment, NO_NEWBORN, jnp.asarray(0.0), jnp.asarray(0.0)
+            )
+            return jnp.sum(found) + jnp.sum(after.real + after.imaginary) + jnp.sum(after.moved_m)
+
+        inexact, rest = eqx.partition(DwellState.nothing(3, 2, NUM_SEGMENTS), eqx.is_inexact_array)
+        return jax.grad(lambda *at: score(at[0], eqx.combine(at[1], rest), at[2]), argnums=(0, 1, 2))(
+            (DwellEvidence(), ReaderModel()), inexact, jnp.zeros((2, NUM_SEGMENTS))
+        )
+
+    for reads in ([], _still([1.0]), _still([1.0, 1.0]), _still([1.0, 1.0 + np.pi / 2])):
+        leaves = jax.tree.leaves(gradient(_arrivals(reads)))
+        assert len(leaves) == 14
+        assert all(np.isfinite(leaf).all() for leaf in leaves)

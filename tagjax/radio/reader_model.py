@@ -103,10 +103,10 @@ class ReaderModel(eqx.Module):
         own_real, own_imaginary = concentration * cos, concentration * sin
         before = safe_sqrt(jnp.square(real) + jnp.square(imaginary))
         after = safe_sqrt(jnp.square(real + own_real) + jnp.square(imaginary + own_imaginary))
-        # |S| - |S'| as a quotient: phasors reach thousands, and their difference in float32 would err by 1e-3 nats.
+        # |S'| + w - |S| as a quotient: phasors reach thousands, and their difference in float32 would err by 1e-3 nats.
         along = real * own_real + imaginary * own_imaginary
-        grown = (2.0 * along + jnp.square(concentration)) / (before + after)
-        ratio = jnp.exp(grown - concentration) * i0e(after) / (i0e(before) * i0e(concentration))
+        lost = 2.0 * (before * concentration - along) / (after + before + concentration)
+        ratio = jnp.exp(-lost) * i0e(after) / (i0e(before) * i0e(concentration))
         outlier = self.outlier.value
         inlier = (1.0 - outlier) * ratio
         fraction = inlier / (inlier + outlier)
