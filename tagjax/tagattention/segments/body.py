@@ -1,0 +1,170 @@
+"""The body that carries a tag: the radio finds its place, and the rigid motion of segments its extent.
+
+Two questions are kept apart. Which body carries the tag is a question to the reads: the place of the tag is distributed
+over segments as exp(evidence / temperature). What belongs to that body is a question to the camera: segments whose motion
+in space is that of the place (`RigidMotion`), and whose neighbours belong to it. The two alternate for a few rounds, as in
+expectation maximisation.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...core.constrained import Positive
+from ...core.numerics import safe_divide, safe_norm
+from .past_motion import PastMotion
+from .rigid import RigidMotion
+
+_TINY = 1e-9
+
+
+class BodyState(eqx.Module):
+    """What is carried from frame to frame."""
+
+    past: PastMotion
+    membership: Float[Array, "tag segment"]  # log odds that the segment belongs to the tag's body, remembered
+
+
+class Bodies(eqx.Module):
+    """Each tag's body at one frame."""
+
+    log_odds: Float[Array, "tag segment"]  # that the segment belongs to the body; very negative for segments at rest
+    place: Float[Array, "tag segment"]  # probability of the tag's place among moving segments; sums to 1, or 0 if none
+    speed_m_s: Float[Array, " segment"]
+
+
+class CarryingBody(eqx.Module):
+    """Stage that finds each tag's body among the segments that move. `CarryingBody()` has good values."""
+
+    rigid: RigidMotion
+    temperature_nats: Positive  # of the tag's place: errors of the increments are common to many reads
+    fit_nats: Positive  # of a segment's weight in the rigid fit, by its evidence below the place's
+    evidence_nats: Positive  # less evidence than the place's counts against membership by its difference over this,
+    most_against: Positive  # but at most so much, nats: parts of a body that turns have less evidence than the place
+    prior: Float[Array, ""]  # log odds of membership before any evidence
+    neighbour_m: Positive  # segments within this distance are neighbours
+    neighbours: Positive  # log odds of a segment whose neighbours are all members (minus it: all others)
+    moving_m_s: Positive  # a segment slower than this is no place for a tag that moves
+    memory_s: Positive  # of the membership
+    num_active: int = eqx.field(static=True)  # segments that are looked at: the fastest, and remembered members
+    num_rounds: int = eqx.field(static=True)
+    speed_s: float = eqx.field(static=True)  # time over which speeds are measured
+
+    def __init__(
+        self,
+        rigid: RigidMotion | None = None,
+        *,
+        temperature_nats: float = 8.0,
+        fit_nats: float = 15.0,
+        evidence_nats: float = 20.0,
+        most_against: float = 4.0,
+        prior: float = -1.0,
+        neighbour_m: float = 0.08,
+        neighbours: float = 2.0,
+        moving_m_s: float = 0.06,
+        memory_s: float = 1.0,
+        num_active: int = 384,
+        num_rounds: int = 3,
+        speed_s: float = 0.25,
+    ) -> None:
+        """Raises `ValueError` for a value that is not positive."""
+        self.rigid = RigidMotion() if rigid is None else rigid
+        self.temperature_nats = Positive(temperature_nats)
+        self.fit_nats = Positive(fit_nats)
+        self.evidence_nats = Positive(evidence_nats)
+        self.most_against = Positive(most_against)
+        self.prior = jnp.asarray(prior, jnp.float32)
+        self.neighbour_m = Positive(neighbour_m)
+        self.neighbours = Positive(neighbours)
+        self.moving_m_s = Positive(moving_m_s)
+        self.memory_s = Positive(memory_s)
+        for name, value in (("num_active", num_active), ("num_rounds", num_rounds)):
+            if value < 1:
+                raise ValueError(f"{name} is {value}; expected at least 1.")
+        if not speed_s > 0:
+            raise ValueError(f"speed_s is {speed_s}; expected a positive time.")
+        self.num_active, self.num_rounds, self.speed_s = num_active, num_rounds, float(speed_s)
+
+    def init(self, num_tags: int, num_segments: int) -> BodyState:
+        """The state before the first frame."""
+        span_s = max(self.speed_s, *self.rigid.lags_s)
+        return BodyState(PastMotion.nothing(num_segments, span_s=span_s), jnp.zeros((num_tags, num_segments)))
+
+    def step(
+        self,
+        state: BodyState,
+        evidence: Float[Array, "tag segment"],
+        centre_m: Float[Array, "segment 3"],
+        area: Float[Array, " segment"],
+        life_s: Float[Array, " segment"],
+        displacement_m: Float[Array, "segment 3"],
+        newborn_source: Int[Array, " segment"],
+        since_s: Float[Array, ""],
+        now_s: Float[Array, ""],
+    ) -> tuple[BodyState, Bodies]:
+        """The state after the frame at `now_s`, and each tag's body.
+
+        `evidence` is that of the reads for a tag at a segment against one at rest, nats; `area` in pixels, 0 for a slot
+        without segment; slot 0 is the static background. `newborn_source` is -2 for a segment that is not newborn, else
+        the slot it comes from, or -1.
+        """
+        num_segments = area.shape[0]
+        newborn = newborn_source > -2
+        inherited = jnp.where(newborn_source > 0, state.membership[:, jnp.maximum(newborn_source, 0)], 0.0)
+        membership = jnp.where(newborn, inherited, state.membership)
+        past = state.past.add(displacement_m, newborn, now_s)
+        moved_m, time_s = past.since(self.speed_s, displacement_m, life_s, now_s)
+        # A segment's first frames show more noise than motion: half the time counts at least.
+        speed_m_s = safe_norm(moved_m) / jnp.maximum(time_s, 0.5 * self.speed_s)
+        exists = (area > 0) & (jnp.arange(num_segments) > 0)
+        rank = jnp.where(exists, speed_m_s + 0.1 * jnp.max(membership, axis=0, initial=0.0), -jnp.inf)
+        _, active = jax.lax.top_k(jax.lax.stop_gradient(rank), min(self.num_active, num_segments))
+        there = exists[active]
+        centre, size = centre_m[active], jnp.where(there, area[active], 0.0)
+
+        close = jnp.sum(jnp.square(centre[:, None] - centre[None]), axis=-1) < jnp.square(self.neighbour_m.value)
+        near = jnp.where(close, size[None], 0.0)
+        near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
+        lagged = [past.since(lag, displacement_m[:], life_s, now_s) for lag in self.rigid.lags_s]
+        before_m = jnp.stack([centre - moved[active] for moved, _ in lagged])
+        long_enough = [elapsed >= 0.8 * lag for (_, elapsed), lag in zip(lagged, self.rigid.lags_s, strict=True)]
+        known = jnp.stack([enough[active] & there for enough in long_enough])
+        width = 0.3 * self.moving_m_s.value
+        moving = jax.nn.log_sigmoid((speed_m_s[active] - self.moving_m_s.value) / width)
+        keep = jnp.exp(-(now_s - since_s) / self.memory_s.value)
+
+        def of_tag(own: Float[Array, " active"], memory: Float[Array, " active"]) -> tuple[Array, Array, Array]:
+            smooth = near @ own
+            level = jnp.where(there, smooth / self.temperature_nats.value + 4.0 * moving, -jnp.inf)
+            top = jnp.max(level, initial=-1e30)
+            place = size * jnp.exp(level - top)
+            place = place / (jnp.sum(place) + _TINY)
+            below = smooth - place @ smooth
+            against = jnp.clip(below / self.evidence_nats.value, -self.most_against.value, 0.0)
+            trusted = jnp.exp(jnp.clip(below / self.fit_nats.value, -20.0, 0.0))
+            # A memory that the place of the tag disagrees with is of another body.
+            valid = jnp.sum(place * memory) > 0
+            memory = jnp.where(valid, memory, 0.0)
+            weight = place
+            log_odds = ratio = jnp.zeros_like(own)
+            for _ in range(self.num_rounds):
+                ratio = self.rigid.log_ratio(weight * trusted, before_m, known, centre)
+                alone = ratio + self.prior + against + memory
+                log_odds = alone + self.neighbours.value * (2.0 * (near @ jax.nn.sigmoid(alone)) - 1.0)
+                weight = size * jax.nn.sigmoid(log_odds)
+                weight = weight + 0.2 * jnp.sum(weight) * place  # the place itself always counts
+            after = keep * memory + (1.0 - keep) * jnp.clip(ratio + against, -4.0, 4.0)
+            return log_odds, place, jnp.clip(after, -4.0, 4.0)
+
+        log_odds, place, remembered = jax.vmap(of_tag)(evidence[:, active], membership[:, active])
+        shape = membership.shape
+        # Segments that are not looked at forget as well.
+        membership = (keep * membership).at[:, active].set(jnp.where(there, remembered, 0.0))
+        return BodyState(past, membership), Bodies(
+            log_odds=jnp.full(shape, -30.0).at[:, active].set(jnp.where(there, log_odds, -30.0)),
+            place=jnp.zeros(shape).at[:, active].set(jnp.where(there, place, 0.0)),
+            speed_m_s=speed_m_s,
+        )
