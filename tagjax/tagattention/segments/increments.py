@@ -6,18 +6,24 @@ mean ranges have on slanted surfaces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...image.warp import gather_taps, pixel_grid
+from ...core.numerics import safe_sqrt
+from ...image.warp import pixel_grid
 from ...tracing.tracer import Camera
-from .labels import STATIC
+from .labels import STATIC, slot_sums
 
 _SAME_SURFACE = 0.03  # taps whose depth differs from the nearest tap's by less than this fraction
 _MIN_WEIGHT = 1e-3
 _MIN_PIXELS = 2
+
+
+# x, y, z: three maps, not one of three channels, which XLA gathers from several times as slowly on a CPU.
+Maps = tuple[Float[Array, "height width"], Float[Array, "height width"], Float[Array, "height width"]]
 
 
 class SegmentMotion(eqx.Module):
@@ -32,27 +38,48 @@ def pixel_sources(
     rays: Float[Array, "height width 3"],
     last_depth_m: Float[Array, "height width"],
     backward_px: Float[Array, "height width 2"],
-) -> tuple[Float[Array, "height width 3"], Bool[Array, "height width"]]:
+) -> tuple[Maps, Bool[Array, "height width"]]:
     """The point of the last frame that each pixel shows: bilinear, over taps on the surface of the nearest tap.
 
     A surface is a depth within 3 % of the nearest tap's. Returns the points, and where the flow's source lies in the
     picture and has depth; the points are 0 elsewhere. Differentiable in depth and flow.
     """
     height, width = last_depth_m.shape
-    points = rays * last_depth_m[..., None]
-    taps = gather_taps(points, backward_px)
-    nearest, largest = jnp.zeros_like(last_depth_m), jnp.full(last_depth_m.shape, -1.0, last_depth_m.dtype)
-    for value, weight in taps:
-        nearest, largest = jnp.where(weight > largest, value[..., 2], nearest), jnp.maximum(weight, largest)
-    total, summed = jnp.zeros_like(last_depth_m), jnp.zeros_like(points)
-    for value, weight in taps:
-        same = (value[..., 2] > 0) & (jnp.abs(value[..., 2] - nearest) < _SAME_SURFACE * nearest)
-        weight = jnp.where(same, weight, 0.0)
-        total, summed = total + weight, summed + weight[..., None] * value
     x, y = pixel_grid(height, width, backward_px.dtype)
     x, y = x + backward_px[..., 0], y + backward_px[..., 1]
-    known = (total > _MIN_WEIGHT) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    return jnp.where(known[..., None], summed / jnp.where(known, total, 1.0)[..., None], 0.0), known
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    x, y = jnp.where(inside, x, 0.0), jnp.where(inside, y, 0.0)
+    left, top = jnp.floor(x), jnp.floor(y)
+    right_weight, down_weight = x - left, y - top
+    column, row = left.astype(jnp.int32), top.astype(jnp.int32)
+    depth = last_depth_m.reshape(-1)
+    index, weight = [], []
+    for down in (0, 1):
+        for right in (0, 1):
+            below, beside = jnp.minimum(row + down, height - 1), jnp.minimum(column + right, width - 1)
+            index.append(below * width + beside)
+            weight.append((down_weight if down else 1.0 - down_weight) * (right_weight if right else 1.0 - right_weight))
+    nearest_row = jnp.where(down_weight > 0.5, jnp.minimum(row + 1, height - 1), row)
+    nearest_column = jnp.where(right_weight > 0.5, jnp.minimum(column + 1, width - 1), column)
+    nearest = depth[nearest_row * width + nearest_column]
+    for tap, at in enumerate(index):
+        same = (depth[at] > 0) & (jnp.abs(depth[at] - nearest) < _SAME_SURFACE * nearest)
+        weight[tap] = jnp.where(same, weight[tap], 0.0)
+    total = weight[0] + weight[1] + weight[2] + weight[3]
+    known = inside & (total > _MIN_WEIGHT)
+    # Divided before they are used: XLA keeps quotients, and computes anew what is cheap for each map that reads it.
+    weight = [one / jnp.where(known, total, 1.0) for one in weight]
+    place = []
+    for axis in range(3):
+        point = rays[..., axis].reshape(-1) * depth
+        mixed = [weight[tap] * point[at] for tap, at in enumerate(index)]
+        place.append(jnp.where(known, mixed[0] + mixed[1] + mixed[2] + mixed[3], 0.0))
+    return (place[0], place[1], place[2]), known
+
+
+def _range_m(points_m: Sequence[Float[Array, "height width"]], antenna_m: Float[Array, "3"]) -> Float[Array, "height width"]:
+    x, y, z = (axis - place for axis, place in zip(points_m, antenna_m, strict=True))
+    return safe_sqrt(x * x + y * y + z * z)
 
 
 def segment_motion(
@@ -68,15 +95,14 @@ def segment_motion(
 
     Labels are constants; the gradient flows through depth and flow.
     """
-    points = camera.rays * depth_m[..., None]
+    points = [camera.rays[..., axis] * depth_m for axis in range(3)]
     before, known = pixel_sources(camera.rays, last_depth_m, backward_px)
-    measured = (counted & known & (depth_m > 0) & (labels > STATIC)).reshape(-1, 1)
-    ranges = camera.ranges_m(points) - camera.ranges_m(before)
-    num_antennas = ranges.shape[0]
-    changes = jnp.concatenate([jnp.moveaxis(ranges, 0, -1), points - before], axis=-1).reshape(-1, num_antennas + 3)
-    columns = jnp.concatenate([jnp.where(measured, changes, 0.0), measured.astype(changes.dtype)], axis=-1)
-    total = jax.ops.segment_sum(columns, jnp.maximum(labels, 0).reshape(-1), num_segments)
-    enough = total[:, -1] >= _MIN_PIXELS
-    mean = jnp.where(enough[:, None], total[:, :-1] / jnp.where(enough, total[:, -1], 1.0)[:, None], 0.0)
+    measured = counted & known & (depth_m > 0) & (labels > STATIC)
+    ranges = [_range_m(points, antenna) - _range_m(before, antenna) for antenna in camera.antennas_m]
+    changes = [*ranges, *(now - then for now, then in zip(points, before, strict=True))]
+    number, *summed = slot_sums([jnp.ones_like(depth_m), *changes], measured, labels, num_segments)
+    enough = number >= _MIN_PIXELS
+    means = jnp.stack([jnp.where(enough, total / jnp.where(enough, number, 1.0), 0.0) for total in summed])
+    num_antennas = len(ranges)
     known_segment = enough | (jnp.arange(num_segments) == STATIC)
-    return SegmentMotion(jnp.moveaxis(mean[:, :num_antennas], -1, 0), mean[:, num_antennas:], known_segment)
+    return SegmentMotion(means[:num_antennas], jnp.moveaxis(means[num_antennas:], 0, -1), known_segment)

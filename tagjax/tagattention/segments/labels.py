@@ -6,6 +6,8 @@ Labels are data: no gradient flows through anything here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,6 +27,10 @@ _SAME_RANGE_M = 0.02  # noise of a range between two frames
 _STAY = 0.05  # a pixel changes to another segment only if that is nearer by this, cells^2
 _START_ROUNDS = 3
 _START_FRACTION = 0.75  # of the slots that the first frame takes
+
+
+# Three maps, not one of three channels: XLA gathers from those five times as fast on a CPU.
+Feature = tuple[Float[Array, "height width"], Float[Array, "height width"], Float[Array, "height width"]]
 
 
 class SegmentState(eqx.Module):
@@ -54,6 +60,18 @@ def on_surface(depth_m: Float[Array, "height width"]) -> Bool[Array, "height wid
     for neighbour in (bordered[:-2, 1:-1], bordered[2:, 1:-1], bordered[1:-1, :-2], bordered[1:-1, 2:]):
         near = near + (jnp.abs(neighbour - depth_m) < _FLYING * depth_m).astype(jnp.int32)
     return (depth_m > 0) & (near >= 2)
+
+
+def slot_sums(
+    values: Sequence[Float[Array, "height width"]],
+    member: Bool[Array, "height width"],
+    labels: Int[Array, "height width"],
+    num_segments: int,
+) -> list[Float[Array, " segment"]]:
+    """Sums of each map over the pixels of each slot that are `member`."""
+    # The others go to a slot that does not exist: masked maps would be computed anew for each sum.
+    slot = jnp.where(member, labels, num_segments).reshape(-1)
+    return [jax.ops.segment_sum(value.reshape(-1), slot, num_segments) for value in values]
 
 
 class Segmenter(eqx.Module):
@@ -143,12 +161,14 @@ class Segmenter(eqx.Module):
         height, width = depth_m.shape
         carried = self._carried(state, rays, depth_m, valid, backward_px, dt_s)
         static = self._static(state, carried, background)
-        foreground = valid & ~static
         side = jnp.clip(self.side_m * focal_px / jnp.maximum(depth_m, 1e-3), self.min_side_px, self.max_side_px)
         x, y = pixel_grid(height, width, depth_m.dtype)
         log_depth = jnp.log(jnp.where(depth_m > 0, depth_m, 1.0))
-        feature = jnp.stack([x, y, self.depth_weight * focal_px * log_depth], axis=-1)
+        feature = x, y, self.depth_weight * focal_px * log_depth
+        # What many later maps read is computed once, not anew in each of their loops.
+        carried, static, side, feature = jax.lax.optimization_barrier((carried, static, side, feature))
 
+        foreground = valid & ~static
         first = ~jnp.any(state.labels >= 0)
         kept = jnp.where(static | (carried == STATIC), NO_LABEL, carried)
         labels = jax.lax.cond(
@@ -156,7 +176,8 @@ class Segmenter(eqx.Module):
             lambda: self._started(feature, foreground),
             lambda: self._reassigned(kept, feature, side, foreground),
         )
-        number = self._count(labels)
+        one = jnp.ones_like(depth_m)
+        (number,) = slot_sums([one], labels > 0, labels, self.num_segments)
         small = number < self.min_pixels
         free = small & (jnp.arange(self.num_segments) != STATIC)
         labels = jnp.where((labels > 0) & ~small[jnp.maximum(labels, 0)], labels, NO_LABEL)
@@ -173,11 +194,9 @@ class Segmenter(eqx.Module):
         counted = (labels > 0) & follows
         labels = jnp.where(valid & static, STATIC, labels)
 
-        points = rays * depth_m[..., None]
-        known = (labels >= 0).astype(depth_m.dtype).reshape(-1, 1)
-        columns = jnp.concatenate([points.reshape(-1, 3), jnp.ones_like(known)], axis=-1) * known
-        total = jax.ops.segment_sum(columns, jnp.maximum(labels, 0).reshape(-1), self.num_segments)
-        area = total[:, 3]
+        points = [rays[..., axis] * depth_m for axis in range(3)]
+        area, *summed = slot_sums([one, *points], labels >= 0, labels, self.num_segments)
+        centre = jnp.stack(summed, axis=-1) / jnp.maximum(area, 1.0)[:, None]
         lives = (area > 0) & ~is_new
         after = SegmentState(
             labels=labels,
@@ -186,7 +205,7 @@ class Segmenter(eqx.Module):
             displacement_m=jnp.where(lives[:, None], state.displacement_m, 0.0),
             moved=lives & state.moved,
             area=area,
-            centre_m=total[:, :3] / jnp.maximum(area, 1.0)[:, None],
+            centre_m=centre,
         )
         return after, Labelling(counted, source, num_unplaced)
 
@@ -234,12 +253,8 @@ class Segmenter(eqx.Module):
             background.matched & background.ripe & background.still & ~moved
         )
 
-    def _count(self, labels: Int[Array, "height width"]) -> Float[Array, " segment"]:
-        weight = (labels > 0).astype(jnp.float32).reshape(-1)
-        return jax.ops.segment_sum(weight, jnp.maximum(labels, 0).reshape(-1), self.num_segments)
-
     def _started(
-        self, feature: Float[Array, "height width 3"], foreground: Bool[Array, "height width"]
+        self, feature: Feature, foreground: Bool[Array, "height width"]
     ) -> Int[Array, "height width"]:
         """The first frame's segments: blocks, reassigned some rounds."""
         height, width = foreground.shape
@@ -247,7 +262,7 @@ class Segmenter(eqx.Module):
         row, column = jnp.arange(height, dtype=jnp.int32) // side_px, jnp.arange(width, dtype=jnp.int32) // side_px
         block = row[:, None] * -(-width // side_px) + column[None] + 1
         labels = jnp.where(foreground, block, NO_LABEL)
-        side = jnp.full(foreground.shape, side_px, feature.dtype)
+        side = jnp.full(foreground.shape, side_px, feature[0].dtype)
         return jax.lax.fori_loop(
             0, _START_ROUNDS, lambda _, now: self._reassigned(now, feature, side, foreground), labels
         )
@@ -255,29 +270,31 @@ class Segmenter(eqx.Module):
     def _reassigned(
         self,
         labels: Int[Array, "height width"],
-        feature: Float[Array, "height width 3"],
+        feature: Feature,
         side_px: Float[Array, "height width"],
         foreground: Bool[Array, "height width"],
     ) -> Int[Array, "height width"]:
         """Each pixel goes to the nearest centre of the labels around it, at steps of its side; -1 beyond the reach."""
         height, width = labels.shape
         flat = labels.reshape(-1)
-        weight = (flat > 0).astype(feature.dtype)[:, None]
-        columns = jnp.concatenate([feature.reshape(-1, 3), jnp.ones_like(weight)], axis=-1) * weight
-        total = jax.ops.segment_sum(columns, jnp.maximum(flat, 0), self.num_segments)
-        centre = total[:, :3] / jnp.maximum(total[:, 3:], 1.0)
+        count, *summed = slot_sums([jnp.ones_like(side_px), *feature], labels > 0, labels, self.num_segments)
+        centre = [total / jnp.maximum(count, 1.0) for total in summed]
 
         step = jnp.round(side_px).astype(jnp.int32)
         row, column = jnp.arange(height, dtype=jnp.int32)[:, None], jnp.arange(width, dtype=jnp.int32)[None]
-        best = jnp.full(labels.shape, self.reach, feature.dtype)
+        best = jnp.full(labels.shape, self.reach, side_px.dtype)
         found = jnp.full(labels.shape, NO_LABEL, labels.dtype)
         for down in (0, -1, 1):
             for right in (0, -1, 1):
                 y, x = row + down * step, column + right * step
                 inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
                 other = jnp.where(inside, flat[jnp.where(inside, y * width + x, 0)], NO_LABEL)
-                away = jnp.sum(jnp.square(feature - centre[jnp.maximum(other, 0)]), axis=-1) / jnp.square(side_px)
+                slot = jnp.maximum(other, 0)
+                apart = [jnp.square(own - table[slot]) for own, table in zip(feature, centre, strict=True)]
+                away = (apart[0] + apart[1] + apart[2]) / jnp.square(side_px)
                 away = jnp.where(other == labels, away - _STAY, away)
                 better = (other > 0) & foreground & (away < best)
                 best, found = jnp.where(better, away, best), jnp.where(better, other, found)
+                # Else XLA computes every offset's distance anew for each of the later ones.
+                best, found = jax.lax.optimization_barrier((best, found))
         return found
