@@ -1,1 +1,11 @@
-"""The tracer whose state lives on persistent segments, shared by all tags."""
+"""The tracer on segments: persistent segments that follow the flow, evidence of the reads, and the body that carries a tag."""
+
+from .background import Background as Background
+from .body import Bodies as Bodies
+from .body import CarryingBody as CarryingBody
+from .dwell import DwellEvidence as DwellEvidence
+from .labels import Segmenter as Segmenter
+from .rigid import RigidMotion as RigidMotion
+from .step import SegmentFrame as SegmentFrame
+from .step import SegmentTracker as SegmentTracker
+from .step import SegmentTrackerState as SegmentTrackerState

@@ -1,0 +1,300 @@
+"""Persistent segments: labels that follow the flow from frame to frame, so that a segment's evidence can add up for seconds.
+
+Slot 0 is the static background; the others are pieces, some `side_m` wide, of what has moved or has yet to prove still.
+Labels are data: no gradient flows through anything here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...core.numerics import safe_norm
+from ...core.parameters import check_positive, check_positive_integers
+from ...image.warp import pixel_grid
+from .background import BackgroundView
+from .cells import NO_LABEL, NOT_NEW, births
+
+STATIC = 0
+"""The slot of the static background."""
+
+_FLYING = 0.02  # neighbours on one surface differ by at most this fraction of their depth
+_SAME_RANGE_M = 0.02  # noise of a range between two frames
+_STAY = 0.05  # a pixel changes to another segment only if that is nearer by this, cells^2
+_START_ROUNDS = 3
+_START_FRACTION = 0.75  # of the slots that the first frame takes
+
+
+# Three maps, not one of three channels: XLA gathers from those five times as fast on a CPU.
+Feature = tuple[Float[Array, "height width"], Float[Array, "height width"], Float[Array, "height width"]]
+
+
+class SegmentState(eqx.Module):
+    """The segments after a frame; a slot without a segment has area 0."""
+
+    labels: Int[Array, "height width"]  # slot of each pixel; 0 = static background, -1 = none
+    depth_m: Float[Array, "height width"]  # of that frame
+    life_s: Float[Array, " segment"]  # time since birth
+    displacement_m: Float[Array, "segment 3"]  # since birth
+    moved: Bool[Array, " segment"]  # was ever displaced by `moved_m`
+    area: Float[Array, " segment"]  # pixels
+    centre_m: Float[Array, "segment 3"]  # mean of its points, camera frame
+
+
+class Labelling(eqx.Module):
+    """What `Segmenter.step` says of a frame beside the state."""
+
+    counted: Bool[Array, "height width"]  # kept its label, or belongs to a new segment and shows a surface seen before
+    source: Int[Array, " segment"]  # slot (of the frame before) that a new segment comes from, -1 = none; -2 = not new
+    num_unplaced: Int[Array, ""]  # new segments that found no free slot
+
+
+def on_surface(depth_m: Float[Array, "height width"]) -> Bool[Array, "height width"]:
+    """Pixels with depth of which at least two of four neighbours lie within 2 % of it; the others fly between surfaces."""
+    bordered = jnp.pad(depth_m, 1)
+    near = jnp.zeros(depth_m.shape, jnp.int32)
+    for neighbour in (bordered[:-2, 1:-1], bordered[2:, 1:-1], bordered[1:-1, :-2], bordered[1:-1, 2:]):
+        near = near + (jnp.abs(neighbour - depth_m) < _FLYING * depth_m).astype(jnp.int32)
+    return (depth_m > 0) & (near >= 2)
+
+
+def slot_sums(
+    values: Sequence[Float[Array, "height width"]],
+    member: Bool[Array, "height width"],
+    labels: Int[Array, "height width"],
+    num_segments: int,
+) -> list[Float[Array, " segment"]]:
+    """Sums of each map over the pixels of each slot that are `member`."""
+    # The others go to a slot that does not exist: masked maps would be computed anew for each sum.
+    slot = jnp.where(member, labels, num_segments).reshape(-1)
+    return [jax.ops.segment_sum(value.reshape(-1), slot, num_segments) for value in values]
+
+
+class Segmenter(eqx.Module):
+    """Cuts what moves into segments and keeps their identity. Lengths in pixels are those of the working resolution.
+
+    Good values: the defaults. `side_m` 0.05 is less than the width of a forearm; `reach` (squared distance from a segment's
+    centre, in sides, beyond which a pixel is not assigned to it) 1.2; `depth_weight` 0.5 (depth of a side counts as half a
+    side); `moved_m` 0.03; `max_speed_m_s` 4 of the range of a surface. `start_side_px` is chosen so that the first frame
+    takes at most 3/4 of the slots where it is None. Raises `ValueError` for values that are not positive.
+    """
+
+    num_segments: int = eqx.field(static=True, default=2048)
+    side_m: float = eqx.field(static=True, default=0.05)
+    min_side_px: int = eqx.field(static=True, default=4)
+    max_side_px: int = eqx.field(static=True, default=12)
+    start_side_px: int | None = eqx.field(static=True, default=None)
+    min_pixels: int = eqx.field(static=True, default=4)
+    reach: float = eqx.field(static=True, default=1.2)
+    depth_weight: float = eqx.field(static=True, default=0.5)
+    moved_m: float = eqx.field(static=True, default=0.03)
+    max_speed_m_s: float = eqx.field(static=True, default=4.0)
+
+    def __check_init__(self) -> None:
+        whole = ("num_segments", "min_side_px", "max_side_px", "min_pixels")
+        check_positive_integers(**{name: getattr(self, name) for name in whole})
+        lengths = ("side_m", "reach", "moved_m", "max_speed_m_s")
+        check_positive(**{name: getattr(self, name) for name in lengths})
+        if not self.depth_weight >= 0:
+            raise ValueError(f"depth_weight is {self.depth_weight}; expected at least 0.")
+        if self.num_segments < 2:
+            raise ValueError("num_segments is 1; expected at least 2: slot 0 is the static background.")
+        if self.max_side_px < self.min_side_px:
+            raise ValueError(f"max_side_px is {self.max_side_px}; expected at least min_side_px, {self.min_side_px}.")
+        if self.start_side_px is not None:
+            check_positive_integers(start_side_px=self.start_side_px)
+
+    def start_side(self, height: int, width: int) -> int:
+        """The side of the first frame's blocks, pixels. Raises `ValueError` where `start_side_px` needs too many slots."""
+
+        def num_blocks(side: int) -> int:
+            return -(-height // side) * -(-width // side)
+
+        if self.start_side_px is not None:
+            if num_blocks(self.start_side_px) >= self.num_segments:
+                raise ValueError(
+                    f"start_side_px is {self.start_side_px}, which cuts {height} x {width} pixels into {num_blocks(self.start_side_px)} "
+                    f"blocks; expected fewer than num_segments, {self.num_segments}. Set it to null, or raise num_segments."
+                )
+            return self.start_side_px
+        side = self.min_side_px
+        while height * width > _START_FRACTION * self.num_segments * side**2 or num_blocks(side) >= self.num_segments:
+            side += 1
+        return side
+
+    def init(self, height: int, width: int) -> SegmentState:
+        """No segment."""
+        self.start_side(height, width)
+        zero = jnp.zeros(self.num_segments)
+        return SegmentState(
+            labels=jnp.full((height, width), NO_LABEL, jnp.int32),
+            depth_m=jnp.zeros((height, width)),
+            life_s=zero,
+            displacement_m=jnp.zeros((self.num_segments, 3)),
+            moved=zero > 0,
+            area=zero,
+            centre_m=jnp.zeros((self.num_segments, 3)),
+        )
+
+    def step(
+        self,
+        state: SegmentState,
+        rays: Float[Array, "height width 3"],
+        depth_m: Float[Array, "height width"],
+        valid: Bool[Array, "height width"],
+        backward_px: Float[Array, "height width 2"],
+        background: BackgroundView,
+        dt_s: Float[Array, ""],
+        focal_px: Float[Array, ""],
+    ) -> tuple[SegmentState, Labelling]:
+        """The segments of the next frame, `dt_s` later. `valid` as from `on_surface`, `background` of this frame.
+
+        Displacements are those of the last frame, 0 for new segments; `displaced` adds this frame's motion.
+        Where no pixel had a label, as at the first frame, everything that is not static is cut into coarse blocks.
+        """
+        rays, depth_m, backward_px = jax.lax.stop_gradient((rays, depth_m, backward_px))
+        background, dt_s, focal_px = jax.lax.stop_gradient((background, dt_s, focal_px))
+        height, width = depth_m.shape
+        carried = self._carried(state, rays, depth_m, valid, backward_px, dt_s)
+        static = self._static(state, carried, background)
+        side = jnp.clip(self.side_m * focal_px / jnp.maximum(depth_m, 1e-3), self.min_side_px, self.max_side_px)
+        x, y = pixel_grid(height, width, depth_m.dtype)
+        log_depth = jnp.log(jnp.where(depth_m > 0, depth_m, 1.0))
+        feature = x, y, self.depth_weight * focal_px * log_depth
+        # What many later maps read is computed once, not anew in each of their loops.
+        carried, static, side, feature = jax.lax.optimization_barrier((carried, static, side, feature))
+
+        foreground = valid & ~static
+        first = ~jnp.any(state.labels >= 0)
+        kept = jnp.where(static | (carried == STATIC), NO_LABEL, carried)
+        labels = jax.lax.cond(
+            first,
+            lambda: self._started(feature, foreground),
+            lambda: self._reassigned(kept, feature, side, foreground),
+        )
+        one = jnp.ones_like(depth_m)
+        (number,) = slot_sums([one], labels > 0, labels, self.num_segments)
+        small = number < self.min_pixels
+        free = small & (jnp.arange(self.num_segments) != STATIC)
+        labels = jnp.where((labels > 0) & ~small[jnp.maximum(labels, 0)], labels, NO_LABEL)
+
+        hole = foreground & (labels < 0) & ~first
+        new, source, num_unplaced = births(
+            hole, side, carried, free, min_side_px=self.min_side_px, min_pixels=self.min_pixels
+        )
+        labels = jnp.where(new > 0, new, labels)
+        # Of the first frame's segments nothing is known of where they come from.
+        source = jnp.where(first & ~free & (jnp.arange(self.num_segments) != STATIC), NO_LABEL, source)
+        is_new = source > NOT_NEW
+        follows = (labels == kept) | (is_new[jnp.maximum(labels, 0)] & (carried >= 0))
+        counted = (labels > 0) & follows
+        labels = jnp.where(valid & static, STATIC, labels)
+
+        points = [rays[..., axis] * depth_m for axis in range(3)]
+        area, *summed = slot_sums([one, *points], labels >= 0, labels, self.num_segments)
+        centre = jnp.stack(summed, axis=-1) / jnp.maximum(area, 1.0)[:, None]
+        lives = (area > 0) & ~is_new
+        after = SegmentState(
+            labels=labels,
+            depth_m=depth_m,
+            life_s=jnp.where(lives, state.life_s + dt_s, 0.0),
+            displacement_m=jnp.where(lives[:, None], state.displacement_m, 0.0),
+            moved=lives & state.moved,
+            area=area,
+            centre_m=centre,
+        )
+        return after, Labelling(counted, source, num_unplaced)
+
+    def displaced(
+        self, state: SegmentState, motion_m: Float[Array, "segment 3"], source: Int[Array, " segment"]
+    ) -> SegmentState:
+        """The state with this frame's motion added to the displacements of the segments that are not new."""
+        old = (state.area > 0) & (source == NOT_NEW)
+        displacement = state.displacement_m + jnp.where(old[:, None], jax.lax.stop_gradient(motion_m), 0.0)
+        moved = state.moved | (old & (safe_norm(displacement) > self.moved_m))
+        return eqx.tree_at(lambda s: (s.displacement_m, s.moved), state, (displacement, moved))
+
+    def _carried(
+        self,
+        state: SegmentState,
+        rays: Float[Array, "height width 3"],
+        depth_m: Float[Array, "height width"],
+        valid: Bool[Array, "height width"],
+        backward_px: Float[Array, "height width 2"],
+        dt_s: Float[Array, ""],
+    ) -> Int[Array, "height width"]:
+        """The label that the flow brings to each pixel from the nearest pixel of the last frame on the same surface."""
+        height, width = depth_m.shape
+        x, y = pixel_grid(height, width, depth_m.dtype)
+        x, y = x + backward_px[..., 0], y + backward_px[..., 1]
+        inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+        column, row = jnp.where(inside, jnp.round(x), 0), jnp.where(inside, jnp.round(y), 0)
+        index = (row * width + column).astype(jnp.int32)
+        length = safe_norm(rays)
+        before = state.depth_m.reshape(-1)[index]
+        apart = jnp.abs(length * depth_m - length.reshape(-1)[index] * before)
+        same = valid & inside & (before > 0) & (apart < _SAME_RANGE_M + self.max_speed_m_s * dt_s)
+        return jnp.where(same, state.labels.reshape(-1)[index], NO_LABEL)
+
+    def _static(
+        self, state: SegmentState, carried: Int[Array, "height width"], background: BackgroundView
+    ) -> Bool[Array, "height width"]:
+        """Pixels of the static background. A segment that has moved keeps its pixels where it pauses."""
+        unlabelled = carried <= 0
+        slot = jnp.maximum(carried, 0)
+        moved = state.moved[slot] & ~unlabelled
+        older = background.age_s > jnp.where(unlabelled, 0.0, state.life_s[slot])
+        confirmed = background.confirmed & (unlabelled | ~background.matched | older | ~moved)
+        return confirmed | (background.matched & background.early & background.still & unlabelled) | (
+            background.matched & background.ripe & background.still & ~moved
+        )
+
+    def _started(
+        self, feature: Feature, foreground: Bool[Array, "height width"]
+    ) -> Int[Array, "height width"]:
+        """The first frame's segments: blocks, reassigned some rounds."""
+        height, width = foreground.shape
+        side_px = self.start_side(height, width)
+        row, column = jnp.arange(height, dtype=jnp.int32) // side_px, jnp.arange(width, dtype=jnp.int32) // side_px
+        block = row[:, None] * -(-width // side_px) + column[None] + 1
+        labels = jnp.where(foreground, block, NO_LABEL)
+        side = jnp.full(foreground.shape, side_px, feature[0].dtype)
+        return jax.lax.fori_loop(
+            0, _START_ROUNDS, lambda _, now: self._reassigned(now, feature, side, foreground), labels
+        )
+
+    def _reassigned(
+        self,
+        labels: Int[Array, "height width"],
+        feature: Feature,
+        side_px: Float[Array, "height width"],
+        foreground: Bool[Array, "height width"],
+    ) -> Int[Array, "height width"]:
+        """Each pixel goes to the nearest centre of the labels around it, at steps of its side; -1 beyond the reach."""
+        height, width = labels.shape
+        flat = labels.reshape(-1)
+        count, *summed = slot_sums([jnp.ones_like(side_px), *feature], labels > 0, labels, self.num_segments)
+        centre = [total / jnp.maximum(count, 1.0) for total in summed]
+
+        step = jnp.round(side_px).astype(jnp.int32)
+        row, column = jnp.arange(height, dtype=jnp.int32)[:, None], jnp.arange(width, dtype=jnp.int32)[None]
+        best = jnp.full(labels.shape, self.reach, side_px.dtype)
+        found = jnp.full(labels.shape, NO_LABEL, labels.dtype)
+        for down in (0, -1, 1):
+            for right in (0, -1, 1):
+                y, x = row + down * step, column + right * step
+                inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+                other = jnp.where(inside, flat[jnp.where(inside, y * width + x, 0)], NO_LABEL)
+                slot = jnp.maximum(other, 0)
+                apart = [jnp.square(own - table[slot]) for own, table in zip(feature, centre, strict=True)]
+                away = (apart[0] + apart[1] + apart[2]) / jnp.square(side_px)
+                away = jnp.where(other == labels, away - _STAY, away)
+                better = (other > 0) & foreground & (away < best)
+                best, found = jnp.where(better, away, best), jnp.where(better, other, found)
+                # Else XLA computes every offset's distance anew for each of the later ones.
+                best, found = jax.lax.optimization_barrier((best, found))
+        return found

@@ -1,0 +1,92 @@
+"""One frame of the tracer's pixel side: background, labels, and the motion of each segment."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...tracing.tracer import Camera
+from .background import Background, BackgroundState
+from .increments import segment_motion
+from .labels import Segmenter, SegmentState, on_surface
+
+
+class SegmentFrame(eqx.Module):
+    """The segments of a frame, shared by all tags. Slot 0 is the static background; unused slots have area 0."""
+
+    labels: Int[Array, "height width"]  # slot of each pixel, -1 = none
+    increment_m: Float[Array, "antenna segment"]  # change of the range since the last frame, 0 where not known
+    motion_m: Float[Array, "segment 3"]  # camera frame, 0 where not known
+    known: Bool[Array, " segment"]
+    centre_m: Float[Array, "segment 3"]  # camera frame
+    area: Float[Array, " segment"]  # pixels
+    life_s: Float[Array, " segment"]  # since birth
+    displacement_m: Float[Array, "segment 3"]  # since birth
+    moved: Bool[Array, " segment"]  # was ever displaced by `labels.moved_m`
+    source: Int[Array, " segment"]  # slot of the last frame that a new segment comes from, -1 = none; -2 = not new
+    num_unplaced: Int[Array, ""]  # new segments that found no free slot
+
+
+class SegmentTrackerState(eqx.Module):
+    """What is carried from frame to frame."""
+
+    background: BackgroundState
+    segments: SegmentState
+
+
+class SegmentTracker(eqx.Module):
+    """Persistent segments of whatever moves, from depth and backward flow. `SegmentTracker()` has good values."""
+
+    background: Background = eqx.field(default_factory=Background)
+    segmenter: Segmenter = eqx.field(default_factory=Segmenter)
+
+    def init(self, camera: Camera) -> SegmentTrackerState:
+        """The state before the first frame. Raises `ValueError` where the first frame would need too many slots."""
+        height, width, _ = camera.rays.shape
+        return SegmentTrackerState(self.background.init(height, width), self.segmenter.init(height, width))
+
+    def step(
+        self,
+        camera: Camera,
+        state: SegmentTrackerState,
+        depth_m: Float[Array, "height width"],
+        backward_px: Float[Array, "height width 2"],
+        dt_s: Float[Array, ""],
+    ) -> tuple[SegmentTrackerState, SegmentFrame]:
+        """The next frame, `dt_s` after the last; `depth_m` is z, 0 = missing.
+
+        `backward_px` lies on the pixels of this frame and points to the last one. Only `increment_m` and `motion_m` have
+        gradients, in depth and flow.
+        """
+        valid, focal = on_surface(depth_m), focal_px(camera)
+        background, view = self.background.step(state.background, depth_m, valid, backward_px, dt_s, focal)
+        segments, found = self.segmenter.step(
+            state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal
+        )
+        motion = segment_motion(
+            camera, segments.labels, found.counted, depth_m, state.segments.depth_m, backward_px,
+            self.segmenter.num_segments,
+        )  # fmt: skip
+        segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
+        frame = SegmentFrame(
+            labels=segments.labels,
+            increment_m=motion.increment_m,
+            motion_m=motion.motion_m,
+            known=motion.known,
+            centre_m=segments.centre_m,
+            area=segments.area,
+            life_s=segments.life_s,
+            displacement_m=segments.displacement_m,
+            moved=segments.moved,
+            source=found.source,
+            num_unplaced=found.num_unplaced,
+        )
+        return SegmentTrackerState(background, segments), frame
+
+
+def focal_px(camera: Camera) -> Float[Array, ""]:
+    """The focal length, pixels, from the rays of the first row; 1 where all are one."""
+    first = camera.rays[0, :, 0]
+    span = first[-1] - first[0]
+    return jnp.where(span > 0, (len(first) - 1) / jnp.where(span > 0, span, 1.0), 1.0)
