@@ -47,6 +47,7 @@ class CarryingBody(eqx.Module):
     prior: Float[Array, ""]  # log odds of membership before any evidence
     neighbour_m: Positive  # segments within this distance are neighbours
     neighbours: Positive  # log odds of a segment whose neighbours are all members (minus it: all others)
+    extent: Positive  # a segment so many standard deviations of the body from its middle has log odds lower by 0.5
     moving_m_s: Positive  # a segment slower than this is no place for a tag that moves
     memory_s: Positive  # of the membership
     num_active: int = eqx.field(static=True)  # segments that are looked at: the fastest, and remembered members
@@ -64,6 +65,7 @@ class CarryingBody(eqx.Module):
         prior: float = -1.0,
         neighbour_m: float = 0.08,
         neighbours: float = 2.0,
+        extent: float = 2.0,
         moving_m_s: float = 0.06,
         memory_s: float = 1.0,
         num_active: int = 384,
@@ -79,6 +81,7 @@ class CarryingBody(eqx.Module):
         self.prior = jnp.asarray(prior, jnp.float32)
         self.neighbour_m = Positive(neighbour_m)
         self.neighbours = Positive(neighbours)
+        self.extent = Positive(extent)
         self.moving_m_s = Positive(moving_m_s)
         self.memory_s = Positive(memory_s)
         for name, value in (("num_active", num_active), ("num_rounds", num_rounds)):
@@ -113,8 +116,8 @@ class CarryingBody(eqx.Module):
         """
         num_segments = area.shape[0]
         newborn = newborn_source > -2
-        inherited = jnp.where(newborn_source > 0, state.membership[:, jnp.maximum(newborn_source, 0)], 0.0)
-        membership = jnp.where(newborn, inherited, state.membership)
+        inherited = jnp.where((newborn_source > 0)[None], state.membership[:, jnp.maximum(newborn_source, 0)], 0.0)
+        membership = jnp.where(newborn[None], inherited, state.membership)
         past = state.past.add(displacement_m, newborn, now_s)
         moved_m, time_s = past.since(self.speed_s, displacement_m, life_s, now_s)
         # A segment's first frames show more noise than motion: half the time counts at least.
@@ -128,7 +131,7 @@ class CarryingBody(eqx.Module):
         close = jnp.sum(jnp.square(centre[:, None] - centre[None]), axis=-1) < jnp.square(self.neighbour_m.value)
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
-        lagged = [past.since(lag, displacement_m[:], life_s, now_s) for lag in self.rigid.lags_s]
+        lagged = [past.since(lag, displacement_m, life_s, now_s) for lag in self.rigid.lags_s]
         before_m = jnp.stack([centre - moved[active] for moved, _ in lagged])
         long_enough = [elapsed >= 0.8 * lag for (_, elapsed), lag in zip(lagged, self.rigid.lags_s, strict=True)]
         known = jnp.stack([enough[active] & there for enough in long_enough])
@@ -142,29 +145,53 @@ class CarryingBody(eqx.Module):
             top = jnp.max(level, initial=-1e30)
             place = size * jnp.exp(level - top)
             place = place / (jnp.sum(place) + _TINY)
-            below = smooth - place @ smooth
+            peak = jnp.argmax(near @ place)
+            reach_m = 2.0 * self.neighbour_m.value
+            start = place * jnp.exp(_distance_log(centre, centre[peak], jnp.square(reach_m)))
+            start = start / (jnp.sum(start) + _TINY)
+            below = smooth - start @ smooth
             against = jnp.clip(below / self.evidence_nats.value, -self.most_against.value, 0.0)
             trusted = jnp.exp(jnp.clip(below / self.fit_nats.value, -20.0, 0.0))
             # A memory that the place of the tag disagrees with is of another body.
-            valid = jnp.sum(place * memory) > 0
+            valid = jnp.sum(start * memory) > 0
             memory = jnp.where(valid, memory, 0.0)
-            weight = place
+            weight = start
             log_odds = ratio = jnp.zeros_like(own)
             for _ in range(self.num_rounds):
                 ratio = self.rigid.log_ratio(weight * trusted, before_m, known, centre)
-                alone = ratio + self.prior + against + memory
+                middle, spread_m2 = _spread(weight, centre)
+                apart = _distance_log(
+                    centre, middle, self.extent.value**2 * spread_m2 + jnp.square(self.neighbour_m.value)
+                )
+                alone = ratio + self.prior + against + memory + apart
                 log_odds = alone + self.neighbours.value * (2.0 * (near @ jax.nn.sigmoid(alone)) - 1.0)
                 weight = size * jax.nn.sigmoid(log_odds)
-                weight = weight + 0.2 * jnp.sum(weight) * place  # the place itself always counts
+                weight = weight + 0.2 * jnp.sum(weight) * start  # the place itself always counts
             after = keep * memory + (1.0 - keep) * jnp.clip(ratio + against, -4.0, 4.0)
             return log_odds, place, jnp.clip(after, -4.0, 4.0)
 
         log_odds, place, remembered = jax.vmap(of_tag)(evidence[:, active], membership[:, active])
         shape = membership.shape
         # Segments that are not looked at forget as well.
-        membership = (keep * membership).at[:, active].set(jnp.where(there, remembered, 0.0))
+        membership = (keep * membership).at[:, active].set(jnp.where(there[None], remembered, 0.0))
         return BodyState(past, membership), Bodies(
-            log_odds=jnp.full(shape, -30.0).at[:, active].set(jnp.where(there, log_odds, -30.0)),
-            place=jnp.zeros(shape).at[:, active].set(jnp.where(there, place, 0.0)),
+            log_odds=jnp.full(shape, -30.0).at[:, active].set(jnp.where(there[None], log_odds, -30.0)),
+            place=jnp.zeros(shape).at[:, active].set(jnp.where(there[None], place, 0.0)),
             speed_m_s=speed_m_s,
         )
+
+
+def _spread(
+    weight: Float[Array, " segment"], centre_m: Float[Array, "segment 3"]
+) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+    """Weighted mean and variance (of all three coordinates together, m^2) of segments; 0 without weight."""
+    share = safe_divide(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
+    middle_m = share @ centre_m
+    return middle_m, share @ jnp.sum(jnp.square(centre_m - middle_m[None]), axis=-1)
+
+
+def _distance_log(
+    centre_m: Float[Array, "segment 3"], from_m: Float[Array, " 3"], variance_m2: Float[Array, ""]
+) -> Float[Array, " segment"]:
+    """Exponent of a normal distribution about a point."""
+    return -0.5 * jnp.sum(jnp.square(centre_m - from_m[None]), axis=-1) / variance_m2

@@ -249,13 +249,13 @@ class Segmenter(eqx.Module):
         moved = state.moved[slot] & ~unlabelled
         older = background.age_s > jnp.where(unlabelled, 0.0, state.life_s[slot])
         confirmed = background.confirmed & (unlabelled | ~background.matched | older | ~moved)
-        return confirmed | (background.matched & background.early & background.still & unlabelled) | (
-            background.matched & background.ripe & background.still & ~moved
+        return (
+            confirmed
+            | (background.matched & background.early & background.still & unlabelled)
+            | (background.matched & background.ripe & background.still & ~moved)
         )
 
-    def _started(
-        self, feature: Feature, foreground: Bool[Array, "height width"]
-    ) -> Int[Array, "height width"]:
+    def _started(self, feature: Feature, foreground: Bool[Array, "height width"]) -> Int[Array, "height width"]:
         """The first frame's segments: blocks, reassigned some rounds."""
         height, width = foreground.shape
         side_px = self.start_side(height, width)

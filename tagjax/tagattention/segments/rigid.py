@@ -79,7 +79,7 @@ class RigidMotion(eqx.Module):
         def of_lag(before: Float[Array, "segment 3"], there: Bool[Array, " segment"]) -> Float[Array, " segment"]:
             own = jnp.where(there, weight, 0.0)
             rotation, shift_m = rigid_fit(own, before, centre_m, self.shrink_m2.value)
-            residual_m2 = jnp.sum(jnp.square(centre_m - before @ rotation.T - shift_m), axis=-1)
+            residual_m2 = jnp.sum(jnp.square(centre_m - before @ rotation.T - shift_m[None]), axis=-1)
             moved_m = safe_norm(centre_m - before)
             moved_m = jnp.maximum(moved_m, safe_divide(jnp.sum(own * moved_m), jnp.sum(own)))
             inside = jnp.square(self.noise_m.value) + jnp.square(self.noise_fraction.value * moved_m)
@@ -104,7 +104,7 @@ def rigid_fit(
     total = jnp.sum(weight)
     share = safe_divide(weight, jnp.broadcast_to(total, weight.shape))
     middle_before, middle_after = share @ before_m, share @ after_m
-    covariance = (before_m - middle_before).T @ ((after_m - middle_after) * share[:, None])
+    covariance = (before_m - middle_before[None]).T @ ((after_m - middle_after[None]) * share[:, None])
     rotation = best_rotation(covariance, shrink_m2)
     return rotation, middle_after - rotation @ middle_before
 
