@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-BACKGROUND = {"confirm_s": 1.5, "early_s": 0.3, "still_m_s": 0.03, "constant_m": 0.004, "quadratic": 0.004, "reveal_s": 0.08}
+BACKGROUND = {
+    "confirm_s": 1.5,
+    "early_s": 0.3,
+    "still_m_s": 0.03,
+    "constant_m": 0.004,
+    "quadratic": 0.004,
+    "reveal_s": 0.08,
+}
 
 
 def surface(depth: np.ndarray) -> np.ndarray:
@@ -62,18 +69,19 @@ def carried(labels, offset, last, depth, valid, rays, flow, dt, max_speed_m_s):
     height, width = depth.shape
     length, most = np.linalg.norm(rays, axis=-1), np.array([height - 1, width - 1])
     out, rest = np.full(depth.shape, -1), np.zeros((height, width, 2), np.float32)
+    direct = np.zeros(depth.shape, bool)
     for y, x in np.argwhere(valid):
         end = np.array([y, x], np.float32) + flow[y, x, ::-1]
         if (end < 0).any() or (end > most).any():
             continue
         plain = tuple(np.rint(end).astype(int))
         exact = tuple(np.clip(np.rint(end - offset[plain]), 0, most).astype(int))
-        for at in (exact, plain):
+        for at in (plain, exact):
             apart = abs(length[y, x] * depth[y, x] - length[at] * last[at])
             if last[at] > 0 and apart < 0.02 + max_speed_m_s * dt:
                 out[y, x], rest[y, x] = labels[at], np.clip(np.array(at, np.float32) + offset[at] - end, -1, 1)
-                break
-    return out, rest
+                direct[y, x] |= at == plain
+    return out, rest, direct
 
 
 def reassigned(labels, feature, side, foreground, reach):
@@ -146,7 +154,7 @@ class Labels:
 
     def step(self, rays, depth, valid, flow, view, dt, focal):
         s, (height, width) = self.s, depth.shape
-        source_label, rest = carried(
+        source_label, rest, direct = carried(
             self.labels, self.offset, self.depth, depth, valid, rays, flow, dt, s.max_speed_m_s
         )  # fmt: skip
         static = np.zeros(depth.shape, bool)
@@ -180,10 +188,12 @@ class Labels:
         if first:
             source[1:][~free[1:]] = -1
         else:
-            new, source, missing = born(foreground & (labels < 0), side, source_label, free, s.min_side_px, s.min_pixels)
+            new, source, missing = born(
+                foreground & (labels < 0), side, source_label, free, s.min_side_px, s.min_pixels
+            )
             labels = np.where(new > 0, new, labels)
         is_new = source > -2
-        counted = (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
+        counted = direct & (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
         self.offset = np.where(((labels > 0) & (labels == kept))[..., None], rest, np.float32(0))
         labels = np.where(valid & static, 0, labels)
         area = np.bincount(labels[labels >= 0], minlength=s.num_segments)

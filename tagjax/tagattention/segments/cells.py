@@ -52,7 +52,9 @@ def births(
     placed = taken & (rank < jnp.sum(free, dtype=jnp.int32))
     slot = jnp.where(placed, slots.astype(jnp.int32)[jnp.clip(rank, 0, free.shape[0] - 1)], NO_LABEL)
     slot_coarse, slot_fine = slot[: coarse.size].reshape(coarse.shape), slot[coarse.size :].reshape(number.shape)
-    picture = jnp.where(_repeated(coarse, coarse_px), _repeated(slot_coarse, coarse_px), _repeated(slot_fine, min_side_px))
+    picture = jnp.where(
+        _repeated(coarse, coarse_px), _repeated(slot_coarse, coarse_px), _repeated(slot_fine, min_side_px)
+    )
     picture = jnp.where(hole, picture[:height, :width], NO_LABEL)
 
     common, votes = _most_common(_cells(label, min_side_px), members.astype(jnp.int32))

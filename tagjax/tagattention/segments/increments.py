@@ -58,7 +58,9 @@ def pixel_sources(
         for right in (0, 1):
             below, beside = jnp.minimum(row + down, height - 1), jnp.minimum(column + right, width - 1)
             index.append(below * width + beside)
-            weight.append((down_weight if down else 1.0 - down_weight) * (right_weight if right else 1.0 - right_weight))
+            weight.append(
+                (down_weight if down else 1.0 - down_weight) * (right_weight if right else 1.0 - right_weight)
+            )
     nearest_row = jnp.where(down_weight > 0.5, jnp.minimum(row + 1, height - 1), row)
     nearest_column = jnp.where(right_weight > 0.5, jnp.minimum(column + 1, width - 1), column)
     nearest = depth[nearest_row * width + nearest_column]
@@ -77,7 +79,9 @@ def pixel_sources(
     return (place[0], place[1], place[2]), known
 
 
-def _range_m(points_m: Sequence[Float[Array, "height width"]], antenna_m: Float[Array, "3"]) -> Float[Array, "height width"]:
+def _range_m(
+    points_m: Sequence[Float[Array, "height width"]], antenna_m: Float[Array, " axis"]
+) -> Float[Array, "height width"]:
     x, y, z = (axis - place for axis, place in zip(points_m, antenna_m, strict=True))
     return safe_sqrt(x * x + y * y + z * z)
 

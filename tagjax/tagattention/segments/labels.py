@@ -38,7 +38,9 @@ class SegmentState(eqx.Module):
     """The segments after a frame; a slot without a segment has area 0."""
 
     labels: Int[Array, "height width"]  # slot of each pixel; 0 = static background, -1 = none
-    offset_x_px: Float[Array, "height width"]  # from a pixel to the point whose label it has: labels lie on whole pixels
+    offset_x_px: Float[
+        Array, "height width"
+    ]  # from a pixel to the point whose label it has: labels lie on whole pixels
     offset_y_px: Float[Array, "height width"]
     depth_m: Float[Array, "height width"]  # of that frame
     life_s: Float[Array, " segment"]  # time since birth
@@ -164,7 +166,7 @@ class Segmenter(eqx.Module):
         rays, depth_m, backward_px = jax.lax.stop_gradient((rays, depth_m, backward_px))
         background, dt_s, focal_px = jax.lax.stop_gradient((background, dt_s, focal_px))
         height, width = depth_m.shape
-        carried, offset_x, offset_y = self._carried(state, rays, depth_m, valid, backward_px, dt_s)
+        carried, offset_x, offset_y, direct = self._carried(state, rays, depth_m, valid, backward_px, dt_s)
         static = self._static(state, carried, background)
         side = jnp.clip(self.side_m * focal_px / jnp.maximum(depth_m, 1e-3), self.min_side_px, self.max_side_px)
         x, y = pixel_grid(height, width, depth_m.dtype)
@@ -196,7 +198,7 @@ class Segmenter(eqx.Module):
         source = jnp.where(first & ~free & (jnp.arange(self.num_segments) != STATIC), NO_LABEL, source)
         is_new = source > NOT_NEW
         follows = (labels == kept) | (is_new[jnp.maximum(labels, 0)] & (carried >= 0))
-        counted = (labels > 0) & follows
+        counted = (labels > 0) & follows & direct
         same_point = (labels > 0) & (labels == kept)
         labels = jnp.where(valid & static, STATIC, labels)
 
@@ -234,8 +236,14 @@ class Segmenter(eqx.Module):
         valid: Bool[Array, "height width"],
         backward_px: Float[Array, "height width 2"],
         dt_s: Float[Array, ""],
-    ) -> tuple[Int[Array, "height width"], Float[Array, "height width"], Float[Array, "height width"]]:
-        """The label that the flow brings to each pixel from the last frame's same surface, and the offset of its point.
+    ) -> tuple[
+        Int[Array, "height width"],
+        Float[Array, "height width"],
+        Float[Array, "height width"],
+        Bool[Array, "height width"],
+    ]:
+        """The label that the flow brings to each pixel from the last frame's same surface, the offset of its point (x, y),
+        and whether the pixel nearest to the flow's source shows that surface, so that motion can be measured there.
 
         It is that of the pixel whose point, its offset included, is nearest to the flow's source. Without offsets, what
         rounding leaves out would add up, and labels would slip along a surface by up to half a pixel a frame.
@@ -260,10 +268,11 @@ class Segmenter(eqx.Module):
         index, same = source(x - offset_x[plain], y - offset_y[plain])
         index = jnp.where(same, index, plain)
         same = same | same_plain
+        most = _MAX_OFFSET_PX
         labels = jnp.where(same, state.labels.reshape(-1)[index], NO_LABEL)
         left_x = (index % width).astype(x.dtype) + offset_x[index] - x
         left_y = (index // width).astype(x.dtype) + offset_y[index] - y
-        return labels, jnp.clip(left_x, -_MAX_OFFSET_PX, _MAX_OFFSET_PX), jnp.clip(left_y, -_MAX_OFFSET_PX, _MAX_OFFSET_PX)
+        return labels, jnp.clip(left_x, -most, most), jnp.clip(left_y, -most, most), same_plain
 
     def _static(
         self, state: SegmentState, carried: Int[Array, "height width"], background: BackgroundView
@@ -274,13 +283,13 @@ class Segmenter(eqx.Module):
         moved = state.moved[slot] & ~unlabelled
         older = background.age_s > jnp.where(unlabelled, 0.0, state.life_s[slot])
         confirmed = background.confirmed & (unlabelled | ~background.matched | older | ~moved)
-        return confirmed | (background.matched & background.early & background.still & unlabelled) | (
-            background.matched & background.ripe & background.still & ~moved
+        return (
+            confirmed
+            | (background.matched & background.early & background.still & unlabelled)
+            | (background.matched & background.ripe & background.still & ~moved)
         )
 
-    def _started(
-        self, feature: Feature, foreground: Bool[Array, "height width"]
-    ) -> Int[Array, "height width"]:
+    def _started(self, feature: Feature, foreground: Bool[Array, "height width"]) -> Int[Array, "height width"]:
         """The first frame's segments: blocks, reassigned some rounds."""
         height, width = foreground.shape
         side_px = self.start_side(height, width)
