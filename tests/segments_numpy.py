@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-BACKGROUND = {"confirm_s": 1.5, "early_s": 0.3, "still_m_s": 0.03, "constant_m": 0.004, "quadratic": 0.004, "reveal_s": 0.08}
+BACKGROUND = {
+    "confirm_s": 1.5,
+    "early_s": 0.3,
+    "still_m_s": 0.03,
+    "constant_m": 0.004,
+    "quadratic": 0.004,
+    "reveal_s": 0.08,
+}
 
 
 def surface(depth: np.ndarray) -> np.ndarray:
@@ -57,19 +64,24 @@ class Memory:
         return {**out, "age_s": age}
 
 
-def carried(labels, last, depth, valid, rays, flow, dt, max_speed_m_s):
-    """The label at the rounded end of each pixel's flow, where the range to the camera is nearly the same."""
+def carried(labels, offset, last, depth, valid, rays, flow, dt, max_speed_m_s):
+    """The label of the point nearest to the end of each pixel's flow, where the range to the camera is nearly the same."""
     height, width = depth.shape
-    length = np.linalg.norm(rays, axis=-1)
-    out = np.full(depth.shape, -1)
+    length, most = np.linalg.norm(rays, axis=-1), np.array([height - 1, width - 1])
+    out, rest = np.full(depth.shape, -1), np.zeros((height, width, 2), np.float32)
+    direct = np.zeros(depth.shape, bool)
     for y, x in np.argwhere(valid):
-        u, v = np.float32(x) + flow[y, x, 0], np.float32(y) + flow[y, x, 1]
-        if 0 <= u <= width - 1 and 0 <= v <= height - 1:
-            at = int(np.rint(v)), int(np.rint(u))
+        end = np.array([y, x], np.float32) + flow[y, x, ::-1]
+        if (end < 0).any() or (end > most).any():
+            continue
+        plain = tuple(np.rint(end).astype(int))
+        exact = tuple(np.clip(np.rint(end - offset[plain]), 0, most).astype(int))
+        for at in (plain, exact):
             apart = abs(length[y, x] * depth[y, x] - length[at] * last[at])
             if last[at] > 0 and apart < 0.02 + max_speed_m_s * dt:
-                out[y, x] = labels[at]
-    return out
+                out[y, x], rest[y, x] = labels[at], np.clip(np.array(at, np.float32) + offset[at] - end, -1, 1)
+                direct[y, x] |= at == plain
+    return out, rest, direct
 
 
 def reassigned(labels, feature, side, foreground, reach):
@@ -137,11 +149,14 @@ class Labels:
     def __init__(self, settings, height: int, width: int) -> None:
         self.s, num = settings, settings.num_segments
         self.labels, self.depth = np.full((height, width), -1), np.zeros((height, width))
+        self.offset = np.zeros((height, width, 2), np.float32)
         self.life, self.moved, self.displacement = np.zeros(num), np.zeros(num, bool), np.zeros((num, 3))
 
     def step(self, rays, depth, valid, flow, view, dt, focal):
         s, (height, width) = self.s, depth.shape
-        source_label = carried(self.labels, self.depth, depth, valid, rays, flow, dt, s.max_speed_m_s)
+        source_label, rest, direct = carried(
+            self.labels, self.offset, self.depth, depth, valid, rays, flow, dt, s.max_speed_m_s
+        )  # fmt: skip
         static = np.zeros(depth.shape, bool)
         for at in map(tuple, np.argwhere(valid)):
             label = source_label[at]
@@ -173,10 +188,13 @@ class Labels:
         if first:
             source[1:][~free[1:]] = -1
         else:
-            new, source, missing = born(foreground & (labels < 0), side, source_label, free, s.min_side_px, s.min_pixels)
+            new, source, missing = born(
+                foreground & (labels < 0), side, source_label, free, s.min_side_px, s.min_pixels
+            )
             labels = np.where(new > 0, new, labels)
         is_new = source > -2
-        counted = (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
+        counted = direct & (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
+        self.offset = np.where(((labels > 0) & (labels == kept))[..., None], rest, np.float32(0))
         labels = np.where(valid & static, 0, labels)
         area = np.bincount(labels[labels >= 0], minlength=s.num_segments)
         lives = (area > 0) & ~is_new

@@ -80,7 +80,7 @@ def pixel_sources(
 
 
 def _range_m(
-    points_m: Sequence[Float[Array, "height width"]], antenna_m: Float[Array, "3"]
+    points_m: Sequence[Float[Array, "height width"]], antenna_m: Float[Array, " axis"]
 ) -> Float[Array, "height width"]:
     x, y, z = (axis - place for axis, place in zip(points_m, antenna_m, strict=True))
     return safe_sqrt(x * x + y * y + z * z)

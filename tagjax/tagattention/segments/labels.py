@@ -24,6 +24,7 @@ STATIC = 0
 
 _FLYING = 0.02  # neighbours on one surface differ by at most this fraction of their depth
 _SAME_RANGE_M = 0.02  # noise of a range between two frames
+_MAX_OFFSET_PX = 1.0
 _STAY = 0.05  # a pixel changes to another segment only if that is nearer by this, cells^2
 _START_ROUNDS = 3
 _START_FRACTION = 0.75  # of the slots that the first frame takes
@@ -37,6 +38,10 @@ class SegmentState(eqx.Module):
     """The segments after a frame; a slot without a segment has area 0."""
 
     labels: Int[Array, "height width"]  # slot of each pixel; 0 = static background, -1 = none
+    offset_x_px: Float[
+        Array, "height width"
+    ]  # from a pixel to the point whose label it has: labels lie on whole pixels
+    offset_y_px: Float[Array, "height width"]
     depth_m: Float[Array, "height width"]  # of that frame
     life_s: Float[Array, " segment"]  # time since birth
     displacement_m: Float[Array, "segment 3"]  # since birth
@@ -132,6 +137,8 @@ class Segmenter(eqx.Module):
         zero = jnp.zeros(self.num_segments)
         return SegmentState(
             labels=jnp.full((height, width), NO_LABEL, jnp.int32),
+            offset_x_px=jnp.zeros((height, width)),
+            offset_y_px=jnp.zeros((height, width)),
             depth_m=jnp.zeros((height, width)),
             life_s=zero,
             displacement_m=jnp.zeros((self.num_segments, 3)),
@@ -159,7 +166,7 @@ class Segmenter(eqx.Module):
         rays, depth_m, backward_px = jax.lax.stop_gradient((rays, depth_m, backward_px))
         background, dt_s, focal_px = jax.lax.stop_gradient((background, dt_s, focal_px))
         height, width = depth_m.shape
-        carried = self._carried(state, rays, depth_m, valid, backward_px, dt_s)
+        carried, offset_x, offset_y, direct = self._carried(state, rays, depth_m, valid, backward_px, dt_s)
         static = self._static(state, carried, background)
         side = jnp.clip(self.side_m * focal_px / jnp.maximum(depth_m, 1e-3), self.min_side_px, self.max_side_px)
         x, y = pixel_grid(height, width, depth_m.dtype)
@@ -191,7 +198,8 @@ class Segmenter(eqx.Module):
         source = jnp.where(first & ~free & (jnp.arange(self.num_segments) != STATIC), NO_LABEL, source)
         is_new = source > NOT_NEW
         follows = (labels == kept) | (is_new[jnp.maximum(labels, 0)] & (carried >= 0))
-        counted = (labels > 0) & follows
+        counted = (labels > 0) & follows & direct
+        same_point = (labels > 0) & (labels == kept)
         labels = jnp.where(valid & static, STATIC, labels)
 
         points = [rays[..., axis] * depth_m for axis in range(3)]
@@ -200,6 +208,8 @@ class Segmenter(eqx.Module):
         lives = (area > 0) & ~is_new
         after = SegmentState(
             labels=labels,
+            offset_x_px=jnp.where(same_point, offset_x, 0.0),
+            offset_y_px=jnp.where(same_point, offset_y, 0.0),
             depth_m=depth_m,
             life_s=jnp.where(lives, state.life_s + dt_s, 0.0),
             displacement_m=jnp.where(lives[:, None], state.displacement_m, 0.0),
@@ -226,19 +236,43 @@ class Segmenter(eqx.Module):
         valid: Bool[Array, "height width"],
         backward_px: Float[Array, "height width 2"],
         dt_s: Float[Array, ""],
-    ) -> Int[Array, "height width"]:
-        """The label that the flow brings to each pixel from the nearest pixel of the last frame on the same surface."""
+    ) -> tuple[
+        Int[Array, "height width"],
+        Float[Array, "height width"],
+        Float[Array, "height width"],
+        Bool[Array, "height width"],
+    ]:
+        """The label that the flow brings to each pixel from the last frame's same surface, the offset of its point (x, y),
+        and whether the pixel nearest to the flow's source shows that surface, so that motion can be measured there.
+
+        It is that of the pixel whose point, its offset included, is nearest to the flow's source. Without offsets, what
+        rounding leaves out would add up, and labels would slip along a surface by up to half a pixel a frame.
+        """
         height, width = depth_m.shape
-        x, y = pixel_grid(height, width, depth_m.dtype)
-        x, y = x + backward_px[..., 0], y + backward_px[..., 1]
+        column, row = pixel_grid(height, width, depth_m.dtype)
+        x, y = column + backward_px[..., 0], row + backward_px[..., 1]
         inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-        column, row = jnp.where(inside, jnp.round(x), 0), jnp.where(inside, jnp.round(y), 0)
-        index = (row * width + column).astype(jnp.int32)
+        x, y = jnp.where(inside, x, 0.0), jnp.where(inside, y, 0.0)
         length = safe_norm(rays)
-        before = state.depth_m.reshape(-1)[index]
-        apart = jnp.abs(length * depth_m - length.reshape(-1)[index] * before)
-        same = valid & inside & (before > 0) & (apart < _SAME_RANGE_M + self.max_speed_m_s * dt_s)
-        return jnp.where(same, state.labels.reshape(-1)[index], NO_LABEL)
+        before_m, range_m = (length * state.depth_m).reshape(-1), length * depth_m
+
+        def source(x: Float[Array, "height width"], y: Float[Array, "height width"]) -> tuple[Array, Array]:
+            at_x, at_y = jnp.clip(jnp.round(x), 0, width - 1), jnp.clip(jnp.round(y), 0, height - 1)
+            index = (at_y * width + at_x).astype(jnp.int32)
+            before = before_m[index]
+            apart = jnp.abs(range_m - before)
+            return index, valid & inside & (before > 0) & (apart < _SAME_RANGE_M + self.max_speed_m_s * dt_s)
+
+        offset_x, offset_y = state.offset_x_px.reshape(-1), state.offset_y_px.reshape(-1)
+        plain, same_plain = source(x, y)
+        index, same = source(x - offset_x[plain], y - offset_y[plain])
+        index = jnp.where(same, index, plain)
+        same = same | same_plain
+        most = _MAX_OFFSET_PX
+        labels = jnp.where(same, state.labels.reshape(-1)[index], NO_LABEL)
+        left_x = (index % width).astype(x.dtype) + offset_x[index] - x
+        left_y = (index // width).astype(x.dtype) + offset_y[index] - y
+        return labels, jnp.clip(left_x, -most, most), jnp.clip(left_y, -most, most), same_plain
 
     def _static(
         self, state: SegmentState, carried: Int[Array, "height width"], background: BackgroundView
