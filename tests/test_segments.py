@@ -10,8 +10,9 @@ import pytest
 import segments_numpy as plain
 
 from tagjax.tagattention.segments import Background, Segmenter, SegmentFrame, SegmentTracker
+from tagjax.tagattention.segments.carry import on_surface
+from tagjax.tagattention.segments.cells import births
 from tagjax.tagattention.segments.increments import segment_motion
-from tagjax.tagattention.segments.labels import on_surface
 from tagjax.tagattention.segments.step import focal_px
 from tagjax.tracing.tracer import Camera
 
@@ -82,13 +83,13 @@ def test_labels_and_increments_are_the_twins(seed: int, num_segments: int) -> No
     tracker = SegmentTracker(Background(confirm_s=0.41, early_s=0.11), segmenter)
     frames = list(_random_scene(seed, 20))
     shape = frames[0][0].shape
-    camera = _camera(*shape, 50.0)
+    camera = _camera(shape[0], shape[1], 50.0)
     rays = np.asarray(camera.rays, np.float64)
     memory, twin = plain.Memory(*shape), plain.Labels(segmenter, *shape)
     step, state = eqx.filter_jit(tracker.step), tracker.init(camera)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plain, "BACKGROUND", plain.BACKGROUND | {"confirm_s": 0.41, "early_s": 0.11})
-        births = unplaced = static = 0
+        num_new = unplaced = static = 0
         for t, (depth, flow) in enumerate(frames):
             last = twin.depth
             state, frame = step(camera, state, jnp.asarray(depth), jnp.asarray(flow), _scalar(DT_S))
@@ -109,12 +110,29 @@ def test_labels_and_increments_are_the_twins(seed: int, num_segments: int) -> No
             np.testing.assert_allclose(frame.life_s, twin.life, atol=1e-5)
             np.testing.assert_allclose(frame.displacement_m, twin.displacement, atol=1e-4)
             np.testing.assert_array_equal(frame.moved, twin.moved)
-            births, unplaced = births + (t > 0) * int((source >= 0).sum()), unplaced + missing
+            num_new, unplaced = num_new + (t > 0) * int((source > -2).sum()), unplaced + missing
             static += int((twin.labels == 0).sum())
-        assert births > 0
+        assert num_new > 2
         assert static > 500
         assert twin.moved.any()
         assert (unplaced > 0) == (num_segments == 24)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cells_and_sources_of_new_segments_are_the_twins(seed: int) -> None:
+    rng, shape = np.random.default_rng(seed), (26, 35)
+    hole = rng.random(shape) < 0.5
+    side = np.where(np.arange(35) < 17, rng.uniform(3, 4, shape), rng.uniform(4.4, 6, shape)).astype(np.float32)
+    carried = rng.integers(-1, 5, shape).astype(np.int32)
+    free = rng.random(24 if seed < 3 else 120) < 0.7
+    free[0] = False
+    given = (jnp.asarray(each) for each in (hole, side, carried, free))
+    found = births(*given, min_side_px=3, min_pixels=4)
+    want = plain.born(hole, side, carried, free, 3, 4)
+    for one, other in zip(found, want, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (want[2] > 0) == (seed < 3)
+    assert seed < 3 or len(np.unique(want[1])) == 7  # -2, and sources -1 to 4
 
 
 def _box_frame(t: float, dt: float, camera: Camera, *, velocity=(0.5, 0.06, -0.2), slope: float = 0.4):
@@ -168,7 +186,8 @@ def test_a_rigid_box_keeps_its_segments_and_its_increments_add_up() -> None:
     for antenna in range(2):
         now, then = (np.linalg.norm(c - ANTENNAS_M[antenna], axis=1) for c in (centre, centre - displacement))
         np.testing.assert_allclose(summed[antenna, lasting], now - then, atol=5e-3)
-    np.testing.assert_allclose(moved[lasting], np.broadcast_to(displacement, (len(lasting), 3)), atol=5e-3)
+    # At outlines taps are missing on one side, which is worth half a pixel across the line of sight.
+    np.testing.assert_allclose(moved[lasting], np.broadcast_to(displacement, (len(lasting), 3)), atol=1e-2)
     np.testing.assert_allclose(np.asarray(frames[-1].displacement_m)[lasting], moved[lasting], atol=1e-4)
     assert np.asarray(frames[-1].moved)[lasting].all()
 
@@ -234,7 +253,8 @@ def test_the_place_where_an_object_stood_is_background_soon_after_it_has_left() 
 def test_compiled_and_eager_steps_agree() -> None:
     tracker = SegmentTracker(segmenter=Segmenter(num_segments=80, side_m=0.1, min_side_px=3))
     frames = list(_random_scene(3, 4))
-    camera = _camera(*frames[0][0].shape, 50.0)
+    shape = frames[0][0].shape
+    camera = _camera(shape[0], shape[1], 50.0)
     eager = compiled = tracker.init(camera)
     step = eqx.filter_jit(tracker.step)
     for depth, flow in frames:
@@ -269,7 +289,8 @@ def test_gradients_of_increments_with_frozen_labels(gradients_agree) -> None:
 def test_gradients_through_whole_steps_reach_flow_and_depth_alone_and_stay_finite() -> None:
     tracker = SegmentTracker(segmenter=Segmenter(num_segments=80, side_m=0.1, min_side_px=3))
     frames = list(_random_scene(5, 3))
-    camera = _camera(*frames[0][0].shape, 50.0)
+    shape = frames[0][0].shape
+    camera = _camera(shape[0], shape[1], 50.0)
 
     @eqx.filter_jit
     @jax.grad
@@ -294,7 +315,7 @@ def test_degenerate_frames_give_defined_and_finite_segments(settings: dict) -> N
     frames = list(_random_scene(6, 6))
     shape = frames[0][0].shape
     nothing, still = np.zeros(shape, np.float32), np.zeros((*shape, 2), np.float32)
-    camera = _camera(*shape, 50.0)
+    camera = _camera(shape[0], shape[1], 50.0)
     far = np.full_like(still, 1e9)
     sequence = [(nothing, still), *frames[:3], (frames[3][0], far), (nothing, still), frames[4], (frames[5][0], still)]
     out = _run(tracker, camera, sequence)
@@ -316,7 +337,7 @@ def test_degenerate_frames_give_defined_and_finite_segments(settings: dict) -> N
 def test_a_step_between_frames_at_one_time_changes_no_label() -> None:
     tracker = SegmentTracker(segmenter=Segmenter(num_segments=80, side_m=0.1, min_side_px=3))
     depth, flow = next(_random_scene(7, 1))
-    camera, still = _camera(*depth.shape, 50.0), np.zeros_like(flow)
+    camera, still = _camera(depth.shape[0], depth.shape[1], 50.0), np.zeros_like(flow)
     first, second = _run(tracker, camera, [(depth, still)] * 2, dt=0.0)
     kept = np.asarray(first.labels) > 0
     assert (np.asarray(first.labels) == np.asarray(second.labels))[kept].mean() > 0.95

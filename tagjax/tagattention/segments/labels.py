@@ -17,14 +17,13 @@ from ...core.numerics import safe_norm
 from ...core.parameters import check_positive, check_positive_integers
 from ...image.warp import pixel_grid
 from .background import BackgroundView
+from .carry import carried_labels
 from .cells import NO_LABEL, NOT_NEW, births
 
 STATIC = 0
 """The slot of the static background."""
 
-_FLYING = 0.02  # neighbours on one surface differ by at most this fraction of their depth
 _SAME_RANGE_M = 0.02  # noise of a range between two frames
-_MAX_OFFSET_PX = 1.0
 _STAY = 0.05  # a pixel changes to another segment only if that is nearer by this, cells^2
 _START_ROUNDS = 3
 _START_FRACTION = 0.75  # of the slots that the first frame takes
@@ -56,15 +55,6 @@ class Labelling(eqx.Module):
     counted: Bool[Array, "height width"]  # kept its label, or belongs to a new segment and shows a surface seen before
     source: Int[Array, " segment"]  # slot (of the frame before) that a new segment comes from, -1 = none; -2 = not new
     num_unplaced: Int[Array, ""]  # new segments that found no free slot
-
-
-def on_surface(depth_m: Float[Array, "height width"]) -> Bool[Array, "height width"]:
-    """Pixels with depth of which at least two of four neighbours lie within 2 % of it; the others fly between surfaces."""
-    bordered = jnp.pad(depth_m, 1)
-    near = jnp.zeros(depth_m.shape, jnp.int32)
-    for neighbour in (bordered[:-2, 1:-1], bordered[2:, 1:-1], bordered[1:-1, :-2], bordered[1:-1, 2:]):
-        near = near + (jnp.abs(neighbour - depth_m) < _FLYING * depth_m).astype(jnp.int32)
-    return (depth_m > 0) & (near >= 2)
 
 
 def slot_sums(
@@ -166,7 +156,10 @@ class Segmenter(eqx.Module):
         rays, depth_m, backward_px = jax.lax.stop_gradient((rays, depth_m, backward_px))
         background, dt_s, focal_px = jax.lax.stop_gradient((background, dt_s, focal_px))
         height, width = depth_m.shape
-        carried, offset_x, offset_y, direct = self._carried(state, rays, depth_m, valid, backward_px, dt_s)
+        carried, offset_x, offset_y, direct = carried_labels(
+            state.labels, state.offset_x_px, state.offset_y_px, state.depth_m,
+            rays, depth_m, valid, backward_px, _SAME_RANGE_M + self.max_speed_m_s * dt_s,
+        )  # fmt: skip
         static = self._static(state, carried, background)
         side = jnp.clip(self.side_m * focal_px / jnp.maximum(depth_m, 1e-3), self.min_side_px, self.max_side_px)
         x, y = pixel_grid(height, width, depth_m.dtype)
@@ -227,52 +220,6 @@ class Segmenter(eqx.Module):
         displacement = state.displacement_m + jnp.where(old[:, None], jax.lax.stop_gradient(motion_m), 0.0)
         moved = state.moved | (old & (safe_norm(displacement) > self.moved_m))
         return eqx.tree_at(lambda s: (s.displacement_m, s.moved), state, (displacement, moved))
-
-    def _carried(
-        self,
-        state: SegmentState,
-        rays: Float[Array, "height width 3"],
-        depth_m: Float[Array, "height width"],
-        valid: Bool[Array, "height width"],
-        backward_px: Float[Array, "height width 2"],
-        dt_s: Float[Array, ""],
-    ) -> tuple[
-        Int[Array, "height width"],
-        Float[Array, "height width"],
-        Float[Array, "height width"],
-        Bool[Array, "height width"],
-    ]:
-        """The label that the flow brings to each pixel from the last frame's same surface, the offset of its point (x, y),
-        and whether the pixel nearest to the flow's source shows that surface, so that motion can be measured there.
-
-        It is that of the pixel whose point, its offset included, is nearest to the flow's source. Without offsets, what
-        rounding leaves out would add up, and labels would slip along a surface by up to half a pixel a frame.
-        """
-        height, width = depth_m.shape
-        column, row = pixel_grid(height, width, depth_m.dtype)
-        x, y = column + backward_px[..., 0], row + backward_px[..., 1]
-        inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-        x, y = jnp.where(inside, x, 0.0), jnp.where(inside, y, 0.0)
-        length = safe_norm(rays)
-        before_m, range_m = (length * state.depth_m).reshape(-1), length * depth_m
-
-        def source(x: Float[Array, "height width"], y: Float[Array, "height width"]) -> tuple[Array, Array]:
-            at_x, at_y = jnp.clip(jnp.round(x), 0, width - 1), jnp.clip(jnp.round(y), 0, height - 1)
-            index = (at_y * width + at_x).astype(jnp.int32)
-            before = before_m[index]
-            apart = jnp.abs(range_m - before)
-            return index, valid & inside & (before > 0) & (apart < _SAME_RANGE_M + self.max_speed_m_s * dt_s)
-
-        offset_x, offset_y = state.offset_x_px.reshape(-1), state.offset_y_px.reshape(-1)
-        plain, same_plain = source(x, y)
-        index, same = source(x - offset_x[plain], y - offset_y[plain])
-        index = jnp.where(same, index, plain)
-        same = same | same_plain
-        most = _MAX_OFFSET_PX
-        labels = jnp.where(same, state.labels.reshape(-1)[index], NO_LABEL)
-        left_x = (index % width).astype(x.dtype) + offset_x[index] - x
-        left_y = (index // width).astype(x.dtype) + offset_y[index] - y
-        return labels, jnp.clip(left_x, -most, most), jnp.clip(left_y, -most, most), same_plain
 
     def _static(
         self, state: SegmentState, carried: Int[Array, "height width"], background: BackgroundView

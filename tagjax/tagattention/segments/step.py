@@ -8,8 +8,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...tracing.tracer import Camera
 from .background import Background, BackgroundState
+from .carry import on_surface
 from .increments import segment_motion
-from .labels import Segmenter, SegmentState, on_surface
+from .labels import Segmenter, SegmentState
 
 
 class SegmentFrame(eqx.Module):
