@@ -73,6 +73,8 @@ def band_curves(path: Path, curves: Mapping[str, Mapping[str, Curve]]) -> None:
         axes.grid(alpha=0.3)
         axes.set(ylabel=label)
         axes.set_ylim(bottom=0, top=None if score == "cle_px" else 1.02)
-    panels[-1].set(xlabel="frames since the tag's first motion (band: 95 % interval of the mean, by recording)")
+    banded = any(np.isfinite(curve.low).any() for by_score in curves.values() for curve in by_score.values())
+    explained = " (band: 95 % interval of the mean, by recording)" if banded else ""  # one recording has no band
+    panels[-1].set(xlabel=f"frames since the tag's first motion{explained}")
     panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, ncols=4)
     save_figure(figure, path, dpi=110)
