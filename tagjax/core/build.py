@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+import typing
 from collections.abc import Callable, Mapping
 from typing import Any
+
+import equinox as eqx
 
 from .settings import ConfigError
 
@@ -20,6 +24,10 @@ def build(settings: Mapping[str, Any], slot: Slot, *, where: str = "_target_", i
     """
     called = find_target(settings, slot, where=where)
     parts = {str(key): value for key, value in settings.items() if key != "_target_"}
+    try:
+        parts = with_modules(called, parts, where=where)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(str(error)) from error
     nested = {key: value for key, value in parts.items() if isinstance(value, Mapping) and "_target_" in value}
     for key, value in nested.items():
         find_target(value, inner or {}, where=f"{where}.{key}")
@@ -32,6 +40,33 @@ def build(settings: Mapping[str, Any], slot: Slot, *, where: str = "_target_", i
         raise ConfigError(f"{where}: {settings['_target_']} does not take these settings: {text}.") from error
     except (ArithmeticError, AttributeError, LookupError, ValueError) as error:
         raise ConfigError(f"{where}: {' '.join(str(error).split())}") from error
+
+
+def with_modules(called: Callable[..., Any], settings: Mapping[str, Any], *, where: str) -> dict[str, Any]:
+    """The settings in which each mapping that stands for a Module has become one, at any depth.
+
+    The annotations of `called` say which arguments are Modules; such a mapping holds that Module's own arguments. Raises
+    `ConfigError` with the dotted path for arguments that a Module does not take, or refuses.
+    """
+    hints = typing.get_type_hints(called.__init__ if isinstance(called, type) else called)
+    parts = dict(settings)
+    for name, value in parts.items():
+        classes = [one for one in (hints.get(name), *typing.get_args(hints.get(name))) if _is_module(one)]
+        if classes and isinstance(value, Mapping):
+            path, (module, *_) = f"{where}.{name}", classes
+            known = inspect.signature(module).parameters
+            if unknown := sorted(set(value) - set(known)):
+                raise ConfigError(f"{path}: unknown key {', '.join(unknown)}; known keys are {', '.join(known)}.")
+            try:
+                parts[name] = module(**with_modules(module, value, where=path))
+            except (TypeError, ValueError) as error:
+                text = " ".join(str(error).split())
+                raise ConfigError(text if text.startswith(where) else f"{path}: {text}") from error
+    return parts
+
+
+def _is_module(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, eqx.Module)
 
 
 def find_target(settings: Mapping[str, Any], slot: Slot, *, where: str) -> Callable[..., Any]:

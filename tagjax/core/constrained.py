@@ -6,14 +6,24 @@ the parameter's type, so no list of names is kept.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import operator
+import reprlib
+from collections.abc import Mapping
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .parameters import check_positive
+
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
+
+ModuleT = TypeVar("ModuleT", bound=eqx.Module)
 
 
 class Positive(eqx.Module):
@@ -50,3 +60,53 @@ class Fraction(eqx.Module):
     def value(self) -> Float[Array, "*shape"]:
         """The fraction."""
         return jax.nn.sigmoid(self.unconstrained)
+
+
+def named_values(module: eqx.Module) -> dict[str, float]:
+    """The learnable scalars of a module and of the modules in it, in physical units, by dotted name (`body.rigid.noise_m`)."""
+    return {name: _value(leaf) for name, leaf in _named(module).items()}
+
+
+def with_named_values(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
+    """The module with these values, with the names and units of `named_values`.
+
+    Raises `ValueError` for missing and unknown names, and for values that the parameter cannot have.
+    """
+    known = _named(module)
+    if set(values) != set(known):
+        missing, unknown = sorted(set(known) - set(values)), sorted(set(values) - set(known))
+        raise ValueError(f"The names of the parameters differ: missing {missing}, unknown {unknown}.")
+    if not known:
+        return module
+    replaced = []
+    for name, leaf in known.items():
+        try:
+            replaced.append(_like(leaf, values[name]))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+    places = [operator.attrgetter(name) for name in known]
+    return eqx.tree_at(lambda m: [place(m) for place in places], module, replaced)
+
+
+def _named(module: eqx.Module) -> dict[str, Positive | Fraction | Array]:
+    """The learnable scalars by dotted name, in the order of the fields."""
+    found: dict[str, Positive | Fraction | Array] = {}
+    for field in dataclasses.fields(module):
+        leaf = getattr(module, field.name)
+        if isinstance(leaf, Positive | Fraction) or (eqx.is_inexact_array(leaf) and leaf.ndim == 0):
+            found[field.name] = leaf
+        elif isinstance(leaf, eqx.Module):
+            found |= {f"{field.name}.{name}": value for name, value in _named(leaf).items()}
+    return found
+
+
+def _value(leaf: Positive | Fraction | Array) -> float:
+    return float(leaf.value if isinstance(leaf, Positive | Fraction) else leaf)
+
+
+def _like(leaf: Positive | Fraction | Array, value: float) -> Positive | Fraction | Array:
+    if isinstance(leaf, Positive | Fraction):
+        return type(leaf)(value)
+    if not abs(value) <= _MAX_FLOAT32:
+        raise ValueError(f"found {reprlib.repr(value)}; expected a value that is finite in float32.")
+    return jnp.asarray(value, jnp.float32)

@@ -16,10 +16,12 @@ from ..tracing.tracer import AbstractTracer
 from . import TagAttention
 from .learned import load_parameters, read_learned
 from .literal import TagAttentionLiteral
+from .segments import TagAttention as SegmentTagAttention
 from .published import TagAttentionPublished
 
 TRACERS: dict[str, type[AbstractTracer]] = {
     "tagjax.tagattention.TagAttention": TagAttention,
+    "tagjax.tagattention.segments.TagAttention": SegmentTagAttention,
     "tagjax.tagattention.published.TagAttentionPublished": TagAttentionPublished,
     "tagjax.tagattention.literal.TagAttentionLiteral": TagAttentionLiteral,
 }

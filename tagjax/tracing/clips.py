@@ -18,6 +18,7 @@ from ..core.settings import ConfigError
 from ..flow.cache import pair_flow
 from ..radio.reads import PhaseReads, RadioWindow
 from ..recording import Recording, RecordingError, RecordingWarning
+from .arrivals import frame_arrivals
 from .range_windows import host_reads, radio_windows, window_reads
 from .tracer import Camera, Frame
 
@@ -28,6 +29,7 @@ Antennas = tuple[int, ...] | Literal["all"] | None
 """Antennas whose reads are used, counted from 1; None is the antenna with the most reads."""
 
 _TRUTH_STD_M = 1e-3
+_MAX_ARRIVALS = 64  # reads of a frame; a reader makes some 1,100 a second at most
 
 
 _one_radio_at_a_time = threading.Lock()
@@ -191,6 +193,7 @@ def load_clip(
     def stacked(parts):
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *parts)
 
+    arrivals, _ = frame_arrivals(recording.reads, tags, chosen, recording.time_ns, origin_ns, _MAX_ARRIVALS)
     radio, reads = jax.tree.map(jnp.asarray, stacked([stacked([radio_of(e, a) for a in chosen]) for e in tags]))
     return Clip(
         camera=Camera(
@@ -204,6 +207,8 @@ def load_clip(
             forward_px=jnp.asarray(forward),
             radio=radio,
             reads=reads,
+            arrivals=jax.tree.map(lambda leaf: jnp.asarray(leaf[start:stop]), arrivals),
+            present=jnp.ones((stop - start, len(tags)), bool),
             colour=jnp.asarray(recording.colour[start:stop]) if colour else None,
         ),
         epcs=tags,

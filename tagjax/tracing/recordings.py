@@ -57,7 +57,14 @@ def _tags(frame: Frame, first: int, size: int) -> Frame:
     exists = there[None, :, None, None]
     radio = RadioWindow(jnp.where(exists, radio.relative_m, 0.0), jnp.where(exists, radio.std_m, jnp.inf))
     reads = eqx.tree_at(lambda one: one.valid, reads, reads.valid & exists)
-    return eqx.tree_at(lambda f: (f.radio, f.reads), frame, (radio, reads))
+    frame = eqx.tree_at(lambda f: (f.radio, f.reads), frame, (radio, reads))
+    if frame.arrivals is None or frame.present is None:
+        return frame
+    number = frame.arrivals.tag - first
+    own = frame.arrivals.valid & (number >= 0) & (number < size)
+    arrivals = eqx.tree_at(lambda a: (a.tag, a.valid), frame.arrivals, (jnp.where(own, number, 0), own))
+    present = pick(frame.present) & there[None]
+    return eqx.tree_at(lambda f: (f.arrivals, f.present), frame, (arrivals, present))
 
 
 def trace_recording(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ..core.numerics import safe_norm
+from ..radio.arrivals import Arrivals
 from ..radio.reads import PhaseReads, RadioWindow
 
 MAX_OBJECTS = 32
@@ -53,6 +54,8 @@ class Frame(eqx.Module):
     radio: RadioWindow  # (*time, tag, antenna, window): causal, from reads up to this frame
     reads: PhaseReads  # (*time, tag, antenna, read): the reads within this frame's window
     colour: UInt8[Array, "*time rows columns 3"] | None = None  # full-size picture, for tracers that compute the flow
+    arrivals: Arrivals | None = None  # (*time, reads): of all tags and antennas, later than the last frame
+    present: Bool[Array, "*time tag"] | None = None  # false for places that hold no tag
     backward_message: BackwardMessage | None = None  # offline smoothing only
     objects: Int[Array, "*time height width"] | None = None  # error budgets only: given objects, 0 = none
 

@@ -3,9 +3,13 @@
 from .background import Background as Background
 from .body import Bodies as Bodies
 from .body import CarryingBody as CarryingBody
+from .detection import Detection as Detection
 from .dwell import DwellEvidence as DwellEvidence
 from .labels import Segmenter as Segmenter
 from .rigid import RigidMotion as RigidMotion
 from .step import SegmentFrame as SegmentFrame
 from .step import SegmentTracker as SegmentTracker
 from .step import SegmentTrackerState as SegmentTrackerState
+from .tracer import SegmentTrace as SegmentTrace
+from .tracer import TagAttention as TagAttention
+from .tracer import TagAttentionState as TagAttentionState

@@ -1,0 +1,69 @@
+"""Detection: the probability that a tag is on the body that its mask shows.
+
+Three hypotheses explain the reads of the last seconds: the tag moves with its body (log likelihood ratio E_b to phases at
+random), it is stationary (E_s), or it is elsewhere, hidden or on something that is not followed, and its phases are at
+random (0). With a temperature T, as errors of a motion are common to many reads, and prior log odds c of the first against
+each other,
+
+    p = exp(E_b / T + c) / (exp(E_b / T + c) + exp(E_s / T) + 1) .
+
+What was read seconds ago says little of where the tag is now. With n reads, each counted as exp(-age / fresh_s), at least
+one of them is recent with probability 1 - exp(-n). The confidence is the product of the two.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...core.constrained import Fraction, Positive
+from ...radio.arrivals import Arrivals
+
+
+class Detection(eqx.Module):
+    """Stage that decides which tags are detected. `Detection()` has good values."""
+
+    temperature_nats: Positive
+    prior: Float[Array, ""]  # log odds of a body against each other hypothesis before any read
+    fresh_s: Positive  # time constant of the reads' age
+    threshold: Fraction  # confidence above which a tag is detected
+
+    def __init__(
+        self,
+        *,
+        temperature_nats: float = 2.0,
+        prior: float = -1.2,
+        fresh_s: float = 0.7,
+        threshold: float = 0.5,
+    ) -> None:
+        """Raises `ValueError` for a time or temperature that is not positive, or a threshold that is not between 0 and 1."""
+        self.temperature_nats, self.fresh_s = Positive(temperature_nats), Positive(fresh_s)
+        self.prior, self.threshold = jnp.asarray(prior, jnp.float32), Fraction(threshold)
+
+    def received(
+        self,
+        num_reads: Float[Array, " tag"],
+        arrivals: Arrivals,
+        since_s: Float[Array, ""],
+        now_s: Float[Array, ""],
+    ) -> Float[Array, " tag"]:
+        """Each tag's number of recent reads after a frame, from that after the last frame."""
+        fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / self.fresh_s.value)
+        new = jax.ops.segment_sum(jnp.where(arrivals.valid, fresh, 0.0), arrivals.tag, num_reads.shape[0])
+        return num_reads * jnp.exp(-(now_s - since_s) / self.fresh_s.value) + new
+
+    def confidence(
+        self,
+        body_nats: Float[Array, " tag"],
+        stationary_nats: Float[Array, " tag"],
+        num_reads: Float[Array, " tag"],
+    ) -> Float[Array, " tag"]:
+        """The probability that each tag is on its body, from the evidence for the hypotheses and the recent reads."""
+        level = jnp.stack([body_nats, stationary_nats, jnp.zeros_like(body_nats)]) / self.temperature_nats.value
+        return jax.nn.softmax(level.at[0].add(self.prior), axis=0)[0] * -jnp.expm1(-num_reads)
+
+    def detected(self, confidence: Float[Array, " tag"]) -> Bool[Array, " tag"]:
+        """Whether the confidence exceeds the threshold."""
+        return confidence > self.threshold.value

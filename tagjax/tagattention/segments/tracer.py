@@ -1,0 +1,169 @@
+"""TagAttention on segments: the composition of its stages.
+
+A frame passes through them in this order:
+
+1. `segments`: depth and flow -> persistent segments and each one's motion (shared by all tags);
+2. `dwell`, with the `reader`'s noise model: this frame's reads -> evidence for each tag at each segment;
+3. `body`: evidence and motion in space -> which segments belong to the body that carries the tag;
+4. `detection`: evidence for that body, and how recent it is -> the probability that the tag is on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...core.constrained import named_values, with_named_values
+from ...core.numerics import safe_divide
+from ...radio.reader_model import ReaderModel
+from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
+from .body import BodyState, CarryingBody
+from .detection import Detection
+from .dwell import DwellEvidence, DwellState
+from .labels import STATIC
+from .outline import (
+    dense_masks,
+    filled_labels,
+    joined_boxes,
+    joined_centroids,
+    segment_boxes,
+    segment_centroids,
+)
+from .step import SegmentTracker, SegmentTrackerState
+
+
+class TagAttentionState(eqx.Module):
+    """What is carried from frame to frame."""
+
+    time_s: Float[Array, ""]  # of the last frame; NaN before the first
+    segments: SegmentTrackerState
+    dwell: DwellState
+    body: BodyState
+    num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
+
+
+class SegmentTrace(eqx.Module):
+    """The output for one frame, for every tag, on segments; `TagAttention.step` makes dense masks of it."""
+
+    labels: Int[Array, "height width"]  # slot of each pixel, -1 = none
+    membership: Float[Array, "tag segment"]  # probability that a segment belongs to the tag's body
+    box_px: Float[Array, "tag 4"]
+    centre_px: Float[Array, "tag 2"]
+    centre_m: Float[Array, "tag 3"]
+    step_m: Float[Array, "tag antenna"]
+    body_nats: Float[Array, " tag"]  # evidence of the reads that the tag moves with the body, against phases at random
+    stationary_nats: Float[Array, " tag"]  # ... that it is stationary
+    num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
+    confidence: Float[Array, " tag"]
+    detected: Bool[Array, " tag"]
+
+
+class TagAttention(AbstractTracer):
+    """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values."""
+
+    segments: SegmentTracker
+    reader: ReaderModel
+    dwell: DwellEvidence
+    body: CarryingBody
+    detection: Detection
+
+    def __init__(
+        self,
+        segments: SegmentTracker | None = None,
+        reader: ReaderModel | None = None,
+        dwell: DwellEvidence | None = None,
+        body: CarryingBody | None = None,
+        detection: Detection | None = None,
+    ) -> None:
+        self.segments = SegmentTracker() if segments is None else segments
+        self.reader = ReaderModel() if reader is None else reader
+        self.dwell = DwellEvidence() if dwell is None else dwell
+        self.body = CarryingBody() if body is None else body
+        self.detection = Detection() if detection is None else detection
+
+    def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
+        """The state before the first frame."""
+        assert frame.present is not None
+        num_tags, num_antennas = frame.present.shape[-1], camera.antennas_m.shape[0]
+        num_segments = self.segments.segmenter.num_segments
+        return TagAttentionState(
+            time_s=jnp.asarray(jnp.nan, jnp.float32),
+            segments=self.segments.init(camera),
+            dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
+            body=self.body.init(num_tags, num_segments),
+            num_reads=jnp.zeros(num_tags),
+        )
+
+    def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
+        """The next state and the output on segments, without dense masks."""
+        assert frame.arrivals is not None and frame.present is not None
+        now_s = frame.time_s
+        since_s = jnp.where(jnp.isfinite(state.time_s), state.time_s, now_s)
+        segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, now_s - since_s)
+        dwell, log_likelihood = self.dwell.step(
+            self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
+        )
+        evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
+        body, bodies = self.body.step(
+            state.body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
+            since_s, now_s,
+        )  # fmt: skip
+        membership = jax.nn.sigmoid(bodies.log_odds) * frame.present[:, None]
+        weight = membership * found.area[None]
+        total = jnp.sum(weight, axis=1)
+
+        def mean(values: Float[Array, "... segment"]) -> Float[Array, "tag ..."]:
+            return safe_divide(weight @ values, jnp.broadcast_to(total[:, None], (total.shape[0], values.shape[-1])))
+
+        body_nats = safe_divide(jnp.sum(weight * log_likelihood, axis=1), total)
+        num_reads = self.detection.received(state.num_reads, frame.arrivals, since_s, now_s)
+        confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
+        labels = filled_labels(found.labels, frame.depth_m)
+        num_segments = found.area.shape[0]
+        member = membership > 0.5
+        box_px = joined_boxes(segment_boxes(labels, num_segments), member)
+        confidence = jnp.where(frame.present & jnp.any(member, axis=1), confidence, 0.0)
+        out = SegmentTrace(
+            labels=labels,
+            membership=membership,
+            box_px=box_px,
+            centre_px=joined_centroids(segment_centroids(labels, num_segments), member),
+            centre_m=mean(found.centre_m),
+            step_m=mean(found.increment_m.T),
+            body_nats=body_nats,
+            stationary_nats=log_likelihood[:, STATIC],
+            num_reads=num_reads,
+            confidence=confidence,
+            detected=self.detection.detected(confidence),
+        )
+        return TagAttentionState(now_s, segments, dwell, body, num_reads), out
+
+    def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
+        """The next state, and the `Trace` of this frame with dense masks."""
+        state, out = self.follow(camera, state, frame)
+        return state, Trace(
+            mask=dense_masks(out.labels, out.membership),
+            box_px=out.box_px,
+            centre_px=out.centre_px,
+            centre_m=out.centre_m,
+            step_m=out.step_m,
+            confidence=out.confidence,
+            detected=out.detected,
+        )
+
+    def finish(self, state: Any) -> Any:
+        """The state itself: it holds no buffer of a frame."""
+        return state
+
+    def physical(self) -> dict[str, float]:
+        """The learnable parameters in physical units, by dotted name."""
+        return named_values(self)
+
+    def with_physical(self, values: Mapping[str, float]) -> TagAttention:
+        """The tracer with these parameters in place of its own. Raises `ValueError` for other names, or impossible values."""
+        return with_named_values(self, values)
