@@ -27,6 +27,6 @@ class Arrivals(eqx.Module):
     time_s: Float[_HostOrDevice, "*batch reads"]  # from the recording's first frame
     phase_rad: Float[_HostOrDevice, "*batch reads"]
     carrier_hz: Float[_HostOrDevice, "*batch reads"]
-    channel: Int[_HostOrDevice, "*batch reads"]  # number of the distinct carrier, from 0
+    channel: Int[_HostOrDevice, "*batch reads"]  # one number for each carrier: kHz
     rssi_dbm: Float[_HostOrDevice, "*batch reads"]
     valid: Bool[_HostOrDevice, "*batch reads"]

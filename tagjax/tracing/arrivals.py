@@ -37,8 +37,7 @@ def frame_arrivals(
     Tags and antennas are numbered as in `epcs` and `antennas` (these counted from 1); times are seconds from `origin_ns`.
     The first frame's reads are those since `since_ns`; it has none if this is None. Where more than `num_reads` arrive,
     the newest of each tag stay, then the second newest of each tag and so on; of equal rank the newest. A missing RSSI
-    becomes `UNKNOWN_RSSI_DBM`. Channels are numbered over all given reads. Raises `ValueError` for a buffer without
-    elements, a tag or antenna given twice, and frames that are not in order of time.
+    becomes `UNKNOWN_RSSI_DBM`. Raises `ValueError` for a buffer without elements, a tag or antenna given twice, and frames that are not in order of time.
     """
     if num_reads < 1:
         raise ValueError(f"num_reads is {num_reads}; expected at least 1 (length of a frame's buffer).")
@@ -55,8 +54,8 @@ def frame_arrivals(
     known = np.isfinite(reads.carrier_hz)
     arrived = (tag >= 0) & (frame >= 0) & (frame < len(frame_time_ns))
     used = arrived & (antenna >= 0) & known
-    channel = np.full(reads.num_reads, -1)
-    channel[known] = np.unique(reads.carrier_hz[known], return_inverse=True)[1].reshape(-1)
+    # The carrier in kHz is a number of the channel that does not depend on which reads are given.
+    channel = np.where(known, np.rint(1e-3 * np.where(known, reads.carrier_hz, 0.0)), -1.0)
 
     chosen = np.flatnonzero(used)
     chosen = chosen[np.argsort(reads.time_ns[chosen], kind="stable")]

@@ -29,7 +29,8 @@ Antennas = tuple[int, ...] | Literal["all"] | None
 """Antennas whose reads are used, counted from 1; None is the antenna with the most reads."""
 
 _TRUTH_STD_M = 1e-3
-_MAX_ARRIVALS = 64  # reads of a frame; a reader makes some 1,100 a second at most
+MAX_ARRIVALS = 64
+"""Reads of one frame that are used; a reader makes some 1,100 a second at most."""
 
 
 _one_radio_at_a_time = threading.Lock()
@@ -118,7 +119,7 @@ def selected_tags(recording: Recording, epcs: Sequence[str] | None) -> tuple[str
     return selected
 
 
-def _subsampled_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
+def subsampled_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
     """Every stride-th pixel; where its depth is missing, the nearest valid one of its stride x stride cell."""
     height, width = depth_m.shape[1:]
     padded = np.pad(depth_m, ((0, 0), (0, -height % stride), (0, -width % stride)))
@@ -168,7 +169,7 @@ def load_clip(
         recording.check_has_depth()
     if recording.depth_kind == "range":
         depth = range_to_depth(depth, recording.intrinsics)
-    depth = _subsampled_depth(depth, stride)
+    depth = subsampled_depth(depth, stride)
     if colour:
         forward = backward = np.zeros((*depth.shape, 2), np.float32)
     else:
@@ -193,7 +194,7 @@ def load_clip(
     def stacked(parts):
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *parts)
 
-    arrivals, _ = frame_arrivals(recording.reads, tags, chosen, recording.time_ns, origin_ns, _MAX_ARRIVALS)
+    arrivals, _ = frame_arrivals(recording.reads, tags, chosen, recording.time_ns, origin_ns, MAX_ARRIVALS)
     radio, reads = jax.tree.map(jnp.asarray, stacked([stacked([radio_of(e, a) for a in chosen]) for e in tags]))
     return Clip(
         camera=Camera(

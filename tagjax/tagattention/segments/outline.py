@@ -48,9 +48,7 @@ def segment_boxes(labels: Int[Array, "height width"], num_segments: int) -> Floa
     return jnp.where(jnp.isfinite(box[:, :1]), box, nothing)
 
 
-def joined_boxes(
-    boxes_px: Float[Array, "segment 4"], member: Bool[Array, "tag segment"]
-) -> Float[Array, "tag 4"]:
+def joined_boxes(boxes_px: Float[Array, "segment 4"], member: Bool[Array, "tag segment"]) -> Float[Array, "tag 4"]:
     """The box around all member segments; zeros where there are none."""
     first = jnp.min(jnp.where(member[..., None], boxes_px[None, :, :2], jnp.inf), axis=1)
     last = jnp.max(jnp.where(member[..., None], boxes_px[None, :, 2:], -jnp.inf), axis=1)
@@ -65,9 +63,7 @@ def segment_centroids(labels: Int[Array, "height width"], num_segments: int) -> 
     return jnp.stack(slot_sums([jnp.ones_like(x), x, y], labels >= 0, labels, num_segments), axis=-1)
 
 
-def joined_centroids(
-    sums: Float[Array, "segment 3"], member: Bool[Array, "tag segment"]
-) -> Float[Array, "tag 2"]:
+def joined_centroids(sums: Float[Array, "segment 3"], member: Bool[Array, "tag segment"]) -> Float[Array, "tag 2"]:
     """The centroid of all member segments from their `segment_centroids`, pixels; 0 where there are none."""
     total = member.astype(sums.dtype) @ sums
     return safe_divide(total[:, 1:], jnp.broadcast_to(total[:, :1], (total.shape[0], 2)))

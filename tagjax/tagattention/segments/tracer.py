@@ -22,6 +22,7 @@ from ...core.constrained import named_values, with_named_values
 from ...core.numerics import safe_divide
 from ...radio.reader_model import ReaderModel
 from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
+from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody
 from .detection import Detection
 from .dwell import DwellEvidence, DwellState
@@ -43,6 +44,7 @@ class TagAttentionState(eqx.Module):
     time_s: Float[Array, ""]  # of the last frame; NaN before the first
     segments: SegmentTrackerState
     dwell: DwellState
+    attention: AttentionState | None
     body: BodyState
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
 
@@ -69,6 +71,7 @@ class TagAttention(AbstractTracer):
     segments: SegmentTracker
     reader: ReaderModel
     dwell: DwellEvidence
+    attention: AttentionEvidence | None
     body: CarryingBody
     detection: Detection
 
@@ -77,12 +80,14 @@ class TagAttention(AbstractTracer):
         segments: SegmentTracker | None = None,
         reader: ReaderModel | None = None,
         dwell: DwellEvidence | None = None,
+        attention: AttentionEvidence | None = None,
         body: CarryingBody | None = None,
         detection: Detection | None = None,
     ) -> None:
         self.segments = SegmentTracker() if segments is None else segments
         self.reader = ReaderModel() if reader is None else reader
         self.dwell = DwellEvidence() if dwell is None else dwell
+        self.attention = attention
         self.body = CarryingBody() if body is None else body
         self.detection = Detection() if detection is None else detection
 
@@ -95,6 +100,7 @@ class TagAttention(AbstractTracer):
             time_s=jnp.asarray(jnp.nan, jnp.float32),
             segments=self.segments.init(camera),
             dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
+            attention=self._no_attention(frame, num_segments),
             body=self.body.init(num_tags, num_segments),
             num_reads=jnp.zeros(num_tags),
         )
@@ -108,6 +114,12 @@ class TagAttention(AbstractTracer):
         dwell, log_likelihood = self.dwell.step(
             self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
         )
+        attention = state.attention
+        if self.attention is not None and attention is not None:
+            attention, agreed = self.attention.step(
+                attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
+            )
+            log_likelihood = log_likelihood + self.attention.weight.value * agreed
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
         body, bodies = self.body.step(
             state.body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
@@ -141,7 +153,13 @@ class TagAttention(AbstractTracer):
             confidence=confidence,
             detected=self.detection.detected(confidence),
         )
-        return TagAttentionState(now_s, segments, dwell, body, num_reads), out
+        return TagAttentionState(now_s, segments, dwell, attention, body, num_reads), out
+
+    def _no_attention(self, frame: Frame, num_segments: int) -> AttentionState | None:
+        if self.attention is None:
+            return None
+        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
+        return AttentionState.nothing(num_tags, num_antennas, num_segments, num_window)
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
         """The next state, and the `Trace` of this frame with dense masks."""
@@ -159,6 +177,39 @@ class TagAttention(AbstractTracer):
     def finish(self, state: Any) -> Any:
         """The state itself: it holds no buffer of a frame."""
         return state
+
+    def with_tags(self, camera: Camera, state: TagAttentionState, source: Int[Array, " tag"]) -> TagAttentionState:
+        """The state for other tags: `source` is each one's place among the present ones, -1 for a new tag."""
+        num_tags, num_segments = source.shape[0], self.segments.segmenter.num_segments
+        fresh = (
+            DwellState.nothing(num_tags, camera.antennas_m.shape[0], num_segments),
+            jnp.zeros((num_tags, num_segments)),
+            jnp.zeros(num_tags),
+        )
+
+        def moved(new: Array, old: Array) -> Array:
+            known = (source >= 0).reshape(-1, *[1] * (new.ndim - 1))
+            return jnp.where(known, old[jnp.maximum(source, 0)], new)
+
+        def per_tag(one: TagAttentionState) -> list[Any]:
+            dwell = one.dwell
+            found = [dwell.real, dwell.imaginary, dwell.began_m, dwell.channel, dwell.log_likelihood]
+            found += [one.body.membership, one.num_reads]
+            return found + ([one.attention.log_likelihood] if one.attention is not None else [])
+
+        dwell, table, row = fresh
+        new = [dwell.real, dwell.imaginary, dwell.began_m, dwell.channel, dwell.log_likelihood, table, row, table]
+        old = per_tag(state)
+        return eqx.tree_at(per_tag, state, [moved(one, other) for one, other in zip(new, old, strict=False)])
+
+    def shifted(self, state: TagAttentionState, by_s: Float[Array, ""]) -> TagAttentionState:
+        """The state with all times later by `by_s`: for another origin of time."""
+
+        def times(one: TagAttentionState) -> list[Any]:
+            found = [one.time_s, one.body.past.time_s]
+            return found + ([one.attention.time_s] if one.attention is not None else [])
+
+        return eqx.tree_at(times, state, [one + by_s for one in times(state)])
 
     def physical(self) -> dict[str, float]:
         """The learnable parameters in physical units, by dotted name."""

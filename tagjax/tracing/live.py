@@ -1,0 +1,193 @@
+"""A tracer fed frame by frame as pictures and reads arrive, with tags that come and go.
+
+The tracer's step is compiled for 1, 2, 4, ..., 64 tags: a new tag takes a free place, and more places are made where there
+is none. So no tag that appears compiles anything, unless it is the first beyond one of these numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from ..core.camera import Intrinsics
+from ..core.geometry import pixel_rays, range_to_depth
+from ..radio.reads import PhaseReads, RadioWindow
+from ..recording import TagReads
+from .arrivals import frame_arrivals
+from .clips import MAX_ARRIVALS, subsampled_depth
+from .tracer import Camera, Frame
+
+MAX_TAGS = 64
+"""Places for tags; beyond, the tag whose last read is oldest gives way."""
+
+_REBASE_S = 1024.0  # times on the device are float32 seconds from an origin, which is moved so often
+
+
+class LiveMethod(Protocol):
+    """What a tracer must have to run live."""
+
+    def init(self, camera: Camera, frame: Frame) -> Any: ...
+
+    def follow(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Any]: ...
+
+    def with_tags(self, camera: Camera, state: Any, source: Int[Array, " tag"]) -> Any: ...
+
+    def shifted(self, state: Any, by_s: Array) -> Any: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveFrame:
+    """The result for one frame: which tag has which place, and the tracer's output for all places."""
+
+    time_ns: int
+    places: dict[str, int]  # EPC -> index of the tag axis
+    trace: Any  # the output of the tracer's `follow`, on the device
+    num_dropped: int  # reads that the frame's buffer did not hold
+
+
+class LiveTracer:
+    """Holds a tracer's state between frames. `process` takes the next frame; frames come in order of time.
+
+    `flow` gives the flow from the first picture to the second, (height, width, 2) pixels; `stride` keeps every n-th pixel;
+    `antennas` are the numbers (from 1) of those at `antennas_m`, of which reads are used. A tag that has not been read for
+    `forget_s` gives its place to a new one. Raises `ValueError` for a stride below 1.
+    """
+
+    def __init__(
+        self,
+        tracer: LiveMethod,
+        intrinsics: Intrinsics,
+        antennas_m: np.ndarray,
+        *,
+        flow: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        stride: int = 2,
+        antennas: tuple[int, ...] = (1,),
+        depth_kind: str = "depth",
+        num_reads: int = MAX_ARRIVALS,
+        forget_s: float = 30.0,
+    ):
+        if stride < 1:
+            raise ValueError(f"stride is {stride}; expected at least 1 (every n-th pixel is kept).")
+        self._tracer, self._intrinsics, self._flow, self._stride = tracer, intrinsics, flow, stride
+        self._antennas, self._range = antennas, depth_kind == "range"
+        self._num_reads, self._forget_ns = num_reads, int(forget_s * 1e9)
+        chosen = np.asarray(antennas_m, np.float32)[np.array(antennas) - 1]
+        self._camera = Camera(
+            rays=jnp.asarray(pixel_rays(intrinsics.scaled(stride))), antennas_m=jnp.asarray(chosen, jnp.float32)
+        )
+        self._no_flow = jnp.zeros((*self._camera.rays.shape[:2], 2))
+        self._places: list[str | None] = [None]
+        self._last_read_ns: dict[str, int] = {}
+        self._state: Any = None
+        self._colour: np.ndarray | None = None
+        self._time_ns, self._origin_ns = 0, 0
+
+    def process(self, colour: np.ndarray, depth_m: np.ndarray, time_ns: int, reads: TagReads) -> LiveFrame:
+        """Trace one frame: colour (height, width, 3) uint8, depth in metres (0 = missing), and the reads since the last one.
+
+        Reads that are later than the frame are not used. Raises `ValueError` for a frame that is not later than the last.
+        """
+        first = self._state is None
+        if first:
+            self._origin_ns = self._time_ns = time_ns
+        elif time_ns <= self._time_ns:
+            raise ValueError(f"Found a frame at {time_ns} ns after one at {self._time_ns} ns; expected a later time.")
+        height, width = self._intrinsics.height, self._intrinsics.width
+        if colour.shape[:2] != (height, width) or depth_m.shape != (height, width):
+            raise ValueError(
+                f"Found colour {colour.shape} and depth {depth_m.shape}; expected {height} x {width} as the intrinsics say."
+            )
+        depth_m = range_to_depth(depth_m[None], self._intrinsics)[0] if self._range else depth_m
+        depth_m = subsampled_depth(depth_m[None], self._stride)[0]
+        if self._colour is None:
+            backward_px = np.zeros((*depth_m.shape, 2), np.float32)
+        else:
+            every = self._stride
+            backward_px = np.asarray(self._flow(colour, self._colour))[::every, ::every] / np.float32(every)
+        self._admit(reads, time_ns)
+        epcs = [epc if epc is not None else f"\0{place}" for place, epc in enumerate(self._places)]
+        arrivals, unused = frame_arrivals(
+            reads, epcs, self._antennas, np.array([time_ns]), self._origin_ns, self._num_reads,
+            since_ns=self._time_ns if not first else None,
+        )  # fmt: skip
+        num_tags, num_antennas = len(epcs), len(self._antennas)
+        frame = Frame(
+            time_s=jnp.asarray((time_ns - self._origin_ns) * 1e-9, jnp.float32),
+            depth_m=jnp.asarray(depth_m, jnp.float32),
+            backward_px=jnp.asarray(backward_px, jnp.float32),
+            forward_px=self._no_flow,
+            radio=RadioWindow(jnp.zeros((num_tags, num_antennas, 2)), jnp.full((num_tags, num_antennas, 2), jnp.inf)),
+            reads=_no_reads(num_tags, num_antennas),
+            arrivals=jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), arrivals),
+            present=jnp.asarray([epc is not None for epc in self._places]),
+        )
+        if first:
+            self._state = _init(self._tracer, self._camera, frame)
+        self._state, trace = _follow((self._tracer, self._camera, frame), self._state)
+        self._colour, self._time_ns = colour, time_ns
+        if time_ns - self._origin_ns > _REBASE_S * 1e9:
+            self._state = _shifted(self._tracer, self._state, jnp.asarray(-_REBASE_S, jnp.float32))
+            self._origin_ns += int(_REBASE_S * 1e9)
+        places = {epc: place for place, epc in enumerate(self._places) if epc is not None}
+        return LiveFrame(time_ns, places, trace, int(unused.num_dropped.sum()))
+
+    def _admit(self, reads: TagReads, time_ns: int) -> None:
+        """Give every tag that was read a place."""
+        used = reads[(reads.time_ns <= time_ns) & np.isin(reads.antenna, self._antennas)]
+        for epc, stamp in zip(used.epc.tolist(), used.time_ns.tolist(), strict=True):
+            self._last_read_ns[epc] = max(stamp, self._last_read_ns.get(epc, stamp))
+        for epc, stamp in list(self._last_read_ns.items()):
+            if time_ns - stamp > self._forget_ns:
+                self._places = [None if one == epc else one for one in self._places]
+                del self._last_read_ns[epc]
+        known = set(self._places)
+        new = [epc for epc in dict.fromkeys(used.epc.tolist()) if epc not in known]
+        if not new:
+            return
+        places: list[str | None] = list(self._places)
+        for epc in new:
+            if None not in places:
+                if len(places) < MAX_TAGS:
+                    places += [None] * len(places)
+                else:
+                    oldest = min((one for one in places if one), key=lambda one: self._last_read_ns[one])
+                    places[places.index(oldest)] = None
+                    del self._last_read_ns[oldest]
+            places[places.index(None)] = epc
+        if self._state is not None:
+            source = [self._places.index(one) if one in known and one is not None else -1 for one in places]
+            self._state = _with_tags(self._tracer, self._camera, self._state, jnp.asarray(source, jnp.int32))
+        self._places = places
+
+
+def _no_reads(num_tags: int, num_antennas: int) -> PhaseReads:
+    zero = np.zeros((num_tags, num_antennas, 1), np.float32)
+    return PhaseReads(zero, zero, zero, zero, zero.astype(np.int32), zero > 0)
+
+
+@eqx.filter_jit
+def _init(tracer: LiveMethod, camera: Camera, frame: Frame) -> Any:
+    return tracer.init(camera, frame)
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _follow(inputs: tuple[LiveMethod, Camera, Frame], state: Any) -> tuple[Any, Any]:
+    tracer, camera, frame = inputs
+    return tracer.follow(camera, state, frame)
+
+
+@eqx.filter_jit
+def _with_tags(tracer: LiveMethod, camera: Camera, state: Any, source: Int[Array, " tag"]) -> Any:
+    return tracer.with_tags(camera, state, source)
+
+
+@eqx.filter_jit
+def _shifted(tracer: LiveMethod, state: Any, by_s: Array) -> Any:
+    return tracer.shifted(state, by_s)
