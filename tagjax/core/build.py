@@ -45,11 +45,12 @@ def build(settings: Mapping[str, Any], slot: Slot, *, where: str = "_target_", i
 def with_modules(called: Callable[..., Any], settings: Mapping[str, Any], *, where: str) -> dict[str, Any]:
     """The settings in which each mapping that stands for a Module has become one, at any depth.
 
-    The annotations of `called` say which arguments are Modules; such a mapping holds that Module's own arguments. Raises
+    The annotations of `called` say which arguments are Modules; such a mapping holds that Module's own arguments. Lists become
+    tuples. Raises
     `ConfigError` with the dotted path for arguments that a Module does not take, or refuses.
     """
     hints = typing.get_type_hints(called.__init__ if isinstance(called, type) else called)
-    parts = dict(settings)
+    parts = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
     for name, value in parts.items():
         classes = [one for one in (hints.get(name), *typing.get_args(hints.get(name))) if _is_module(one)]
         if classes and isinstance(value, Mapping):

@@ -1,13 +1,20 @@
 """One model of a reader's phases: thermal noise, what motion and reflections add to it, outliers, pi flips.
 
-Within a dwell (the time that a reader stays on one carrier) a read r has the phase m (wave d_r) + offset + noise, where d_r
-is the distance moved since the dwell's first read, wave = 4 pi f / c, and m is 2 where phases count modulo pi, else 1. With
-von Mises noise of concentration w_r and a flat prior of the offset, n reads depend on one number, their phasor:
+Within a dwell (the time that a reader stays on one carrier) a read has the phase m (wave d + offset) + noise, where d is the
+tag's distance, wave = 4 pi f / c, and m is 2 where phases count modulo pi, else 1. What is known of the phase at the present
+distance is a von Mises distribution: its phasor P has the direction of the phase and the length of its concentration, 0 at
+the dwell's first read. A motion by x turns it, and makes it less sure by the variance of the motion's error, which grows
+with the way:
 
-    S = sum_r w_r exp(j m (phi_r - wave d_r)) ,    p(phi_1 .. phi_n) = I0(|S|) / prod_r 2 pi I0(w_r) .
+    P' = P exp(j m wave x) / (1 + |P| v) ,    v = (m wave)^2 drift |x| .
 
-A read that makes S of S' has the log likelihood ratio g = log I0(|S|) - log I0(|S'|) - log I0(w) to a phase at random. With
-outliers of probability q it is log((1 - q) exp(g) + q).
+A read phi of concentration w adds to it, and has the log likelihood ratio g to a phase at random; with outliers of
+probability q that is log((1 - q) exp(g) + q):
+
+    P = P' + w exp(j m phi) ,    g = log I0(|P|) - log I0(|P'|) - log I0(w) .
+
+The error of a motion since the last read counts, not that since the dwell began: reads that follow each other agree in phase
+even where reflections have changed it along the way.
 """
 
 from __future__ import annotations
@@ -35,7 +42,7 @@ class ReaderModel(eqx.Module):
     floor_rad: Positive  # thermal noise at a high RSSI
     spread_rad: Positive  # standard deviation beside thermal noise: reflections, errors of the motion
     still_spread_rad: Positive  # the same of a tag that stays in place
-    slack: Positive  # standard deviation as a fraction of the phase moved since the dwell began
+    drift_m: Positive  # variance of a motion's error, m^2, for each metre: reflections change, and motions are not exact
     outlier: Fraction  # probability of a read with any phase
     modulo_pi: bool = eqx.field(static=True)  # phases count modulo pi, so that pi flips do not matter
 
@@ -47,17 +54,17 @@ class ReaderModel(eqx.Module):
         floor_rad: float = FLOOR_RAD,
         spread_rad: float = 0.064,
         still_spread_rad: float = 0.03,
-        slack: float = 0.2,
+        drift_m: float = 0.001,
         outlier: float = 0.04,
         modulo_pi: bool = True,
     ) -> None:
-        """Raises `ValueError` for a spread, floor or slack that is not positive, or an outlier probability of 0 or 1."""
+        """Raises `ValueError` for a spread, floor or drift that is not positive, or an outlier probability of 0 or 1."""
         self.slope_per_dbm = jnp.asarray(slope_per_dbm, jnp.float32)
         self.intercept = jnp.asarray(intercept, jnp.float32)
         self.floor_rad = Positive(floor_rad)
         self.spread_rad = Positive(spread_rad)
         self.still_spread_rad = Positive(still_spread_rad)
-        self.slack = Positive(slack)
+        self.drift_m = Positive(drift_m)
         self.outlier = Fraction(outlier)
         self.modulo_pi = modulo_pi
 
@@ -73,33 +80,40 @@ class ReaderModel(eqx.Module):
         return jnp.sqrt(jnp.square(self.floor_rad.value) + jnp.square(by_rssi))
 
     def concentration(
-        self,
-        rssi_dbm: Float[Array, "*#batch"],
-        carrier_hz: Float[Array, "*#batch"],
-        moved_m: Float[Array, "*batch"],
-        still: Bool[Array, "*#batch"],
+        self, rssi_dbm: Float[Array, "*#batch"], still: Bool[Array, "*#batch"]
     ) -> Float[Array, "*batch"]:
-        """w = 1 / (m^2 variance) of reads whose tag would have moved so far since the dwell's first read.
-
-        The variance is thermal^2 + spread^2 + (slack wave moved)^2; where `still`, `still_spread_rad` is the spread.
-        """
+        """w = 1 / (m^2 variance) of reads; where `still`, `still_spread_rad` is the spread beside thermal noise."""
         spread = jnp.where(still, self.still_spread_rad.value, self.spread_rad.value)
-        slack_rad = self.slack.value * distance_to_phase(moved_m, carrier_hz)
-        variance = jnp.square(self.thermal_rad(rssi_dbm)) + jnp.square(spread) + jnp.square(slack_rad)
-        return 1.0 / (self.multiple**2 * variance)
+        return 1.0 / (self.multiple**2 * (jnp.square(self.thermal_rad(rssi_dbm)) + jnp.square(spread)))
+
+    def moved(
+        self,
+        real: Float[Array, "*batch"],
+        imaginary: Float[Array, "*batch"],
+        moved_m: Float[Array, "*batch"],
+        carrier_hz: Float[Array, "*#batch"],
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        """The phasor after the tag has moved by `moved_m`: turned by the phase of that, and less sure by its error."""
+        turn_rad = self.multiple * distance_to_phase(moved_m, carrier_hz)
+        wave = self.multiple * distance_to_phase(jnp.ones_like(moved_m), carrier_hz)
+        variance = jnp.square(wave) * self.drift_m.value * safe_sqrt(jnp.square(moved_m))
+        size = safe_sqrt(jnp.square(real) + jnp.square(imaginary))
+        kept = 1.0 / (1.0 + size * variance)
+        cos, sin = cos_sin(turn_rad)
+        return kept * (real * cos - imaginary * sin), kept * (real * sin + imaginary * cos)
 
     def add_read(
         self,
         real: Float[Array, "*batch"],
         imaginary: Float[Array, "*batch"],
         concentration: Float[Array, "*batch"],
-        residual_rad: Float[Array, "*batch"],
+        phase_rad: Float[Array, "*#batch"],
     ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Float[Array, "*batch"]]:
         """A read's log likelihood ratio to a phase at random (nats), and the phasor after it, real and imaginary part.
 
-        `residual_rad` is phi - wave d. The read counts in the phasor by the probability that it is no outlier.
+        The read counts in the phasor by the probability that it is no outlier.
         """
-        cos, sin = cos_sin(self.multiple * residual_rad)
+        cos, sin = cos_sin(self.multiple * phase_rad)
         own_real, own_imaginary = concentration * cos, concentration * sin
         before = safe_sqrt(jnp.square(real) + jnp.square(imaginary))
         after = safe_sqrt(jnp.square(real + own_real) + jnp.square(imaginary + own_imaginary))

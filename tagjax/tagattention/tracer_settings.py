@@ -16,8 +16,8 @@ from ..tracing.tracer import AbstractTracer
 from . import TagAttention
 from .learned import load_parameters, read_learned
 from .literal import TagAttentionLiteral
-from .segments import TagAttention as SegmentTagAttention
 from .published import TagAttentionPublished
+from .segments import TagAttention as SegmentTagAttention
 
 TRACERS: dict[str, type[AbstractTracer]] = {
     "tagjax.tagattention.TagAttention": TagAttention,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -30,6 +30,7 @@ MAX_TAGS = 64
 _REBASE_S = 1024.0  # times on the device are float32 seconds from an origin, which is moved so often
 
 
+@runtime_checkable
 class LiveMethod(Protocol):
     """What a tracer must have to run live."""
 

@@ -118,7 +118,7 @@ class AttentionEvidence(eqx.Module):
         def of_tag(one: RadioWindow, likelihood: Float[Array, " segment"]) -> Float[Array, " segment"]:
             known_radio = jnp.all(jnp.isfinite(one.std_m), axis=-1)
             speed = jax.vmap(lambda rd: radio_speed(rd, time_s))(one.relative_m)
-            gates = self.gate.open(speed) * known_radio
+            gates = jnp.where(known_radio, self.gate.open(speed), 0.0)
             evidence = jax.vmap(of_antenna)(rho_m, one.relative_m)
             return likelihood + gates @ evidence
 

@@ -2,10 +2,10 @@
 
 Three hypotheses explain the reads of the last seconds: the tag moves with its body (log likelihood ratio E_b to phases at
 random), it is stationary (E_s), or it is elsewhere, hidden or on something that is not followed, and its phases are at
-random (0). With a temperature T, as errors of a motion are common to many reads, and prior log odds c of the first against
-each other,
+random (0). With a temperature T, as errors of a motion are common to many reads, and prior log odds c_s and c_e of the last
+two against the first,
 
-    p = exp(E_b / T + c) / (exp(E_b / T + c) + exp(E_s / T) + 1) .
+    p = exp(E_b / T) / (exp(E_b / T) + exp(E_s / T + c_s) + exp(c_e)) .
 
 What was read seconds ago says little of where the tag is now. With n reads, each counted as exp(-age / fresh_s), at least
 one of them is recent with probability 1 - exp(-n). The confidence is the product of the two.
@@ -26,7 +26,8 @@ class Detection(eqx.Module):
     """Stage that decides which tags are detected. `Detection()` has good values."""
 
     temperature_nats: Positive
-    prior: Float[Array, ""]  # log odds of a body against each other hypothesis before any read
+    stationary: Float[Array, ""]  # prior log odds of a stationary tag against one on its body
+    elsewhere: Float[Array, ""]  # prior log odds of a tag that is elsewhere; low: reflections change phases that fit
     fresh_s: Positive  # time constant of the reads' age
     threshold: Fraction  # confidence above which a tag is detected
 
@@ -34,13 +35,15 @@ class Detection(eqx.Module):
         self,
         *,
         temperature_nats: float = 2.0,
-        prior: float = -1.2,
+        stationary: float = 1.3,
+        elsewhere: float = -4.0,
         fresh_s: float = 0.7,
         threshold: float = 0.5,
     ) -> None:
         """Raises `ValueError` for a time or temperature that is not positive, or a threshold that is not between 0 and 1."""
         self.temperature_nats, self.fresh_s = Positive(temperature_nats), Positive(fresh_s)
-        self.prior, self.threshold = jnp.asarray(prior, jnp.float32), Fraction(threshold)
+        self.stationary, self.elsewhere = (jnp.asarray(odds, jnp.float32) for odds in (stationary, elsewhere))
+        self.threshold = Fraction(threshold)
 
     def received(
         self,
@@ -61,8 +64,11 @@ class Detection(eqx.Module):
         num_reads: Float[Array, " tag"],
     ) -> Float[Array, " tag"]:
         """The probability that each tag is on its body, from the evidence for the hypotheses and the recent reads."""
-        level = jnp.stack([body_nats, stationary_nats, jnp.zeros_like(body_nats)]) / self.temperature_nats.value
-        return jax.nn.softmax(level.at[0].add(self.prior), axis=0)[0] * -jnp.expm1(-num_reads)
+        temperature_nats = self.temperature_nats.value
+        stationary = stationary_nats / temperature_nats + self.stationary
+        elsewhere = jnp.broadcast_to(self.elsewhere, stationary.shape)
+        level = jnp.stack([body_nats / temperature_nats, stationary, elsewhere])
+        return jax.nn.softmax(level, axis=0)[0] * -jnp.expm1(-num_reads)
 
     def detected(self, confidence: Float[Array, " tag"]) -> Bool[Array, " tag"]:
         """Whether the confidence exceeds the threshold."""

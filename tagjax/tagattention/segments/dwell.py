@@ -1,8 +1,8 @@
 """Dwell evidence: how well each segment's motion explains each tag's raw phases, every read counted once.
 
-The likelihood of a dwell's reads depends on one phasor a (tag, antenna, segment); see `radio.reader_model` for the
-equations. Phasors are relative to the segment's distance at the dwell's first read. So a read touches one row of segments,
-and a frame without reads touches no phasor: only the distances, which all tags share, are summed every frame.
+What a dwell's reads say of the next one is one phasor a (tag, antenna, segment); see `radio.reader_model` for the equations.
+It is that of the last read. So a read touches one row of segments, and a frame without reads touches no phasor: only the
+distances, which all tags share, are summed every frame.
 
 Evidence is the log likelihood ratio to phases at random, in nats; that of several antennas adds up. Slot 0 is the static
 background: a tag that stays in place.
@@ -30,9 +30,9 @@ _Rows = tuple[Array, Array, Array]
 class DwellState(eqx.Module):
     """What the reads so far amount to, for the tags at each segment."""
 
-    real: Float[Array, "tag antenna segment"]  # phasor, relative to the dwell's first read
+    real: Float[Array, "tag antenna segment"]  # phasor of the phase at the dwell's last read
     imaginary: Float[Array, "tag antenna segment"]
-    began_m: Float[Array, "tag antenna segment"]  # `distance_m` at the dwell's first read
+    read_m: Float[Array, "tag antenna segment"]  # `distance_m` at the dwell's last read
     distance_m: Float[Array, "antenna segment"]  # sum of the increments, inherited by newborn segments
     channel: Int[Array, "tag antenna"]  # of the present dwell; -1 before the first read
     log_likelihood: Float[Array, "tag segment"]  # decayed sum over reads, nats
@@ -44,7 +44,7 @@ class DwellState(eqx.Module):
         return DwellState(
             real=jnp.zeros(rows),
             imaginary=jnp.zeros(rows),
-            began_m=jnp.zeros(rows),
+            read_m=jnp.zeros(rows),
             distance_m=jnp.zeros(rows[1:]),
             channel=jnp.full(rows[:2], -1, jnp.int32),
             log_likelihood=jnp.zeros((num_tags, num_segments)),
@@ -52,8 +52,8 @@ class DwellState(eqx.Module):
 
     @property
     def moved_m(self) -> Float[Array, "tag antenna segment"]:
-        """Distance moved since the dwell's first read."""
-        return self.distance_m[None] - self.began_m
+        """Distance moved since the dwell's last read."""
+        return self.distance_m[None] - self.read_m
 
 
 class DwellEvidence(eqx.Module):
@@ -95,12 +95,11 @@ class DwellEvidence(eqx.Module):
             """The evidence of a read for every segment, and the rows of its tag and antenna after it."""
             distance_m = last_m[read.antenna] + part * increment_m[read.antenna]
             real, imaginary = (jnp.where(goes_on, row, 0.0) for row in rows[:2])
-            began_m = jnp.where(goes_on, rows[2], distance_m)
-            moved_m = distance_m - began_m
-            concentration = reader.concentration(read.rssi_dbm, read.carrier_hz, moved_m, ~moving)
-            residual_rad = read.phase_rad - distance_to_phase(moved_m, read.carrier_hz)
-            evidence, real, imaginary = reader.add_read(real, imaginary, concentration, residual_rad)
-            return evidence, (real, imaginary, began_m)
+            moved_m = jnp.where(goes_on, distance_m - rows[2], 0.0)
+            real, imaginary = reader.moved(real, imaginary, moved_m, read.carrier_hz)
+            concentration = reader.concentration(read.rssi_dbm, ~moving)
+            evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
+            return evidence, (real, imaginary, distance_m)
 
         def add(carry: tuple[_Rows, Array, Array], one: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
             tables, channel, log_likelihood = carry
@@ -125,12 +124,12 @@ class DwellEvidence(eqx.Module):
             ), None
 
         num_antennas, shape = increment_m.shape[0], state.real.shape
-        tables = tuple(table.reshape(-1, shape[-1]) for table in (state.real, state.imaginary, state.began_m))
+        tables = tuple(table.reshape(-1, shape[-1]) for table in (state.real, state.imaginary, state.read_m))
         carry = (tables, state.channel.reshape(-1), decay * state.log_likelihood)
         (tables, channel, log_likelihood), _ = jax.lax.scan(add, carry, (arrivals, fraction, fresh))
-        real, imaginary, began_m = (table.reshape(shape) for table in tables)
+        real, imaginary, read_m = (table.reshape(shape) for table in tables)
         distance_m = last_m + increment_m
-        after = DwellState(real, imaginary, began_m, distance_m, channel.reshape(shape[:2]), log_likelihood)
+        after = DwellState(real, imaginary, read_m, distance_m, channel.reshape(shape[:2]), log_likelihood)
         return after, log_likelihood
 
 
@@ -145,7 +144,7 @@ def _inherit(state: DwellState, newborn_source: Int[Array, " segment"]) -> Dwell
     return DwellState(
         real=of(state.real),
         imaginary=of(state.imaginary),
-        began_m=of(state.began_m),
+        read_m=of(state.read_m),
         distance_m=of(state.distance_m),
         channel=state.channel,
         log_likelihood=of(state.log_likelihood),

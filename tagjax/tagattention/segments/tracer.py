@@ -107,7 +107,8 @@ class TagAttention(AbstractTracer):
 
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
         """The next state and the output on segments, without dense masks."""
-        assert frame.arrivals is not None and frame.present is not None
+        assert frame.arrivals is not None
+        assert frame.present is not None
         now_s = frame.time_s
         since_s = jnp.where(jnp.isfinite(state.time_s), state.time_s, now_s)
         segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, now_s - since_s)
@@ -125,7 +126,7 @@ class TagAttention(AbstractTracer):
             state.body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
             since_s, now_s,
         )  # fmt: skip
-        membership = jax.nn.sigmoid(bodies.log_odds) * frame.present[:, None]
+        membership = jnp.where(frame.present[:, None], jax.nn.sigmoid(bodies.log_odds), 0.0)
         weight = membership * found.area[None]
         total = jnp.sum(weight, axis=1)
 
@@ -193,12 +194,12 @@ class TagAttention(AbstractTracer):
 
         def per_tag(one: TagAttentionState) -> list[Any]:
             dwell = one.dwell
-            found = [dwell.real, dwell.imaginary, dwell.began_m, dwell.channel, dwell.log_likelihood]
+            found = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
             found += [one.body.membership, one.num_reads]
             return found + ([one.attention.log_likelihood] if one.attention is not None else [])
 
         dwell, table, row = fresh
-        new = [dwell.real, dwell.imaginary, dwell.began_m, dwell.channel, dwell.log_likelihood, table, row, table]
+        new = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood, table, row, table]
         old = per_tag(state)
         return eqx.tree_at(per_tag, state, [moved(one, other) for one, other in zip(new, old, strict=False)])
 
