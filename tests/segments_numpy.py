@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
+
+from tagjax.tagattention.segments.carry import next_dither
 
 BACKGROUND = {
     "confirm_s": 1.5,
@@ -64,24 +67,26 @@ class Memory:
         return {**out, "age_s": age}
 
 
-def carried(labels, offset, last, depth, valid, rays, flow, dt, max_speed_m_s):
-    """The label of the point nearest to the end of each pixel's flow, where the range to the camera is nearly the same."""
+def carried(labels, last, depth, valid, rays, flow, dt, max_speed_m_s, dither):
+    """The label at the rounded end of each pixel's flow and dither, where the range to the camera is nearly the same.
+
+    And where it is nearly the same at the flow's rounded end.
+    """
     height, width = depth.shape
     length, most = np.linalg.norm(rays, axis=-1), np.array([height - 1, width - 1])
-    out, rest = np.full(depth.shape, -1), np.zeros((height, width, 2), np.float32)
-    direct = np.zeros(depth.shape, bool)
+    out, direct = np.full(depth.shape, -1), np.zeros(depth.shape, bool)
     for y, x in np.argwhere(valid):
         end = np.array([y, x], np.float32) + flow[y, x, ::-1]
         if (end < 0).any() or (end > most).any():
             continue
-        plain = tuple(np.rint(end).astype(int))
-        exact = tuple(np.clip(np.rint(end - offset[plain]), 0, most).astype(int))
-        for at in (plain, exact):
+        for shift in (dither[::-1], np.zeros(2, np.float32)):
+            at = tuple(np.clip(np.rint(end + shift), 0, most).astype(int))
             apart = abs(length[y, x] * depth[y, x] - length[at] * last[at])
             if last[at] > 0 and apart < 0.02 + max_speed_m_s * dt:
-                out[y, x], rest[y, x] = labels[at], np.clip(np.array(at, np.float32) + offset[at] - end, -1, 1)
-                direct[y, x] |= at == plain
-    return out, rest, direct
+                if shift.any() or not dither.any():
+                    out[y, x] = labels[at]
+                direct[y, x] |= not shift.any()
+    return out, direct
 
 
 def reassigned(labels, feature, side, foreground, reach):
@@ -149,14 +154,15 @@ class Labels:
     def __init__(self, settings, height: int, width: int) -> None:
         self.s, num = settings, settings.num_segments
         self.labels, self.depth = np.full((height, width), -1), np.zeros((height, width))
-        self.offset = np.zeros((height, width, 2), np.float32)
+        self.dither = np.zeros(2, np.float32)
         self.life, self.moved, self.displacement = np.zeros(num), np.zeros(num, bool), np.zeros((num, 3))
 
     def step(self, rays, depth, valid, flow, view, dt, focal):
         s, (height, width) = self.s, depth.shape
-        source_label, rest, direct = carried(
-            self.labels, self.offset, self.depth, depth, valid, rays, flow, dt, s.max_speed_m_s
-        )  # fmt: skip
+        source_label, direct = carried(
+            self.labels, self.depth, depth, valid, rays, flow, dt, s.max_speed_m_s, self.dither
+        )
+        self.dither = np.asarray(next_dither(jnp.asarray(self.dither)))
         static = np.zeros(depth.shape, bool)
         for at in map(tuple, np.argwhere(valid)):
             label = source_label[at]
@@ -194,7 +200,6 @@ class Labels:
             labels = np.where(new > 0, new, labels)
         is_new = source > -2
         counted = direct & (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
-        self.offset = np.where(((labels > 0) & (labels == kept))[..., None], rest, np.float32(0))
         labels = np.where(valid & static, 0, labels)
         area = np.bincount(labels[labels >= 0], minlength=s.num_segments)
         lives = (area > 0) & ~is_new
