@@ -67,26 +67,18 @@ class Memory:
         return {**out, "age_s": age}
 
 
-def carried(labels, last, depth, valid, rays, flow, dt, max_speed_m_s, dither):
-    """The label at the rounded end of each pixel's flow and dither, where the range to the camera is nearly the same.
-
-    And where it is nearly the same at the flow's rounded end.
-    """
-    height, width = depth.shape
-    length, most = np.linalg.norm(rays, axis=-1), np.array([height - 1, width - 1])
-    out, direct = np.full(depth.shape, -1), np.zeros(depth.shape, bool)
+def carried(labels, last, depth, valid, flow, max_change, dither):
+    """The label at the rounded end of each pixel's flow and dither, where the depth is nearly the same."""
+    most = np.array([depth.shape[0] - 1, depth.shape[1] - 1])
+    out = np.full(depth.shape, -1)
     for y, x in np.argwhere(valid):
         end = np.array([y, x], np.float32) + flow[y, x, ::-1]
         if (end < 0).any() or (end > most).any():
             continue
-        for shift in (dither[::-1], np.zeros(2, np.float32)):
-            at = tuple(np.clip(np.rint(end + shift), 0, most).astype(int))
-            apart = abs(length[y, x] * depth[y, x] - length[at] * last[at])
-            if last[at] > 0 and apart < 0.02 + max_speed_m_s * dt:
-                if shift.any() or not dither.any():
-                    out[y, x] = labels[at]
-                direct[y, x] |= not shift.any()
-    return out, direct
+        at = tuple(np.clip(np.rint(end + dither[::-1]), 0, most).astype(int))
+        if last[at] > 0 and abs(depth[y, x] - last[at]) < max_change:
+            out[y, x] = labels[at]
+    return out
 
 
 def reassigned(labels, feature, side, foreground, reach):
@@ -159,9 +151,7 @@ class Labels:
 
     def step(self, rays, depth, valid, flow, view, dt, focal):
         s, (height, width) = self.s, depth.shape
-        source_label, direct = carried(
-            self.labels, self.depth, depth, valid, rays, flow, dt, s.max_speed_m_s, self.dither
-        )
+        source_label = carried(self.labels, self.depth, depth, valid, flow, 0.02 + s.max_speed_m_s * dt, self.dither)
         self.dither = np.asarray(next_dither(jnp.asarray(self.dither)))
         static = np.zeros(depth.shape, bool)
         for at in map(tuple, np.argwhere(valid)):
@@ -199,7 +189,7 @@ class Labels:
             )
             labels = np.where(new > 0, new, labels)
         is_new = source > -2
-        counted = direct & (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
+        counted = (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
         labels = np.where(valid & static, 0, labels)
         area = np.bincount(labels[labels >= 0], minlength=s.num_segments)
         lives = (area > 0) & ~is_new
@@ -213,24 +203,26 @@ class Labels:
         self.moved |= self.lives & (np.linalg.norm(self.displacement, axis=1) > self.s.moved_m)
 
 
-def motion(rays, antennas, labels, counted, depth, last, flow, num_segments):
+def motion(rays, antennas, labels, counted, depth, last, flow, max_change, num_segments):
     """Mean change of range (antenna, segment) and of place (segment, 3), and where it is known."""
     height, width = depth.shape
+    pixel = np.array([rays[0, 1, 0] - rays[0, 0, 0], rays[1, 0, 1] - rays[0, 0, 1]])
     changes = [[] for _ in range(num_segments)]
     for y, x in np.argwhere(counted & (depth > 0) & (labels > 0)):
         u, v = float(x) + float(flow[y, x, 0]), float(y) + float(flow[y, x, 1])
         if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
             continue
         nearest = last[int(np.rint(v)), int(np.rint(u))]
-        total, mixed = 0.0, np.zeros(3)
+        total, mixed = 0.0, 0.0
         for row in {int(np.floor(v)), int(np.ceil(v))}:
             for column in {int(np.floor(u)), int(np.ceil(u))}:
                 tap = last[row, column]
                 if tap > 0 and abs(tap - nearest) < 0.03 * nearest:
                     weight = (1 - abs(u - column)) * (1 - abs(v - row))
-                    total, mixed = total + weight, mixed + weight * tap * rays[row, column]
-        if total > 1e-3:
-            now, then = depth[y, x] * rays[y, x], mixed / total
+                    total, mixed = total + weight, mixed + weight * tap
+        if total > 1e-3 and abs(depth[y, x] - mixed / total) < max_change:
+            ray = np.append(rays[y, x, :2] + pixel * flow[y, x], 1.0)
+            now, then = depth[y, x] * rays[y, x], mixed / total * ray
             ranges = [np.linalg.norm(now - a) - np.linalg.norm(then - a) for a in antennas]
             changes[labels[y, x]].append([*ranges, *(now - then)])
     known = np.array([len(c) >= 2 for c in changes])

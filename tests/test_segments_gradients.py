@@ -41,7 +41,7 @@ def test_gradients_of_increments_with_frozen_labels(gradients_agree) -> None:
     def motion(flow_px, depth_m, last_depth_m):
         camera = Camera(jnp.asarray(rays, flow_px.dtype), jnp.asarray(ANTENNAS_M, flow_px.dtype))
         found = segment_motion(
-            camera, jnp.asarray(labels), jnp.asarray(counted), depth_m, last_depth_m, flow_px, 5
+            camera, jnp.asarray(labels), jnp.asarray(counted), depth_m, last_depth_m, flow_px, jnp.asarray(0.5, flow_px.dtype), 5
         )  # fmt: skip
         return jnp.concatenate([found.increment_m, found.motion_m.T])
 

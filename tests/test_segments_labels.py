@@ -37,7 +37,15 @@ def test_labels_and_increments_are_the_twins(seed: int, num_segments: int) -> No
             np.testing.assert_array_equal(frame.source, source, err_msg=f"frame {t}")
             assert int(frame.num_unplaced) == missing
             increment, motion, known = plain.motion(
-                rays, ANTENNAS_M.astype(float), twin.labels, counted, depth.astype(float), last, flow, num_segments
+                rays,
+                ANTENNAS_M.astype(float),
+                twin.labels,
+                counted,
+                depth.astype(float),
+                last,
+                flow,
+                0.02 + segmenter.max_speed_m_s * DT_S,
+                num_segments,
             )
             twin.displaced(motion)
             np.testing.assert_allclose(frame.increment_m, increment, atol=1e-5)

@@ -56,7 +56,7 @@ def _moving_box(rate_hz: float, seconds: float, *, dropped: tuple[int, ...] = ()
     tracker = SegmentTracker(segmenter=Segmenter(num_segments=num_segments))
     step, state = eqx.filter_jit(tracker.step), tracker.init(view)
     times = [t / rate_hz for t in range(int(seconds * rate_hz)) if t not in dropped]
-    out, measured, last = [], 0.0, 0.0
+    out, measured, last, mask = [], 0.0, 0.0, np.zeros(view.rays.shape[:2], bool)
     for t, time in enumerate(times):
         moved, before = max(time - 0.5, 0.0), max(last - 0.5, 0.0)
         depth, flow, mask, _ = box_frame(moved, moved - before, view, velocity=(0.4, 0.0, -0.2))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...core.numerics import safe_norm
 from ...image.warp import pixel_grid
 from .cells import NO_LABEL
 
@@ -30,15 +29,13 @@ def next_dither(dither_px: Float[Array, " axis"]) -> Float[Array, " axis"]:
 def carried_labels(
     last_labels: Int[Array, "height width"],
     last_depth_m: Float[Array, "height width"],
-    rays: Float[Array, "height width 3"],
     depth_m: Float[Array, "height width"],
     valid: Bool[Array, "height width"],
     backward_px: Float[Array, "height width 2"],
     max_change_m: Float[Array, ""],
     dither_px: Float[Array, " axis"],
-) -> tuple[Int[Array, "height width"], Bool[Array, "height width"]]:
-    """The label that the flow brings to each pixel from the same surface, a range that differs by less than `max_change_m`;
-    and whether the pixel nearest to the flow's source shows that surface, so that motion can be measured there.
+) -> Int[Array, "height width"]:
+    """The label that the flow brings to each pixel from the same surface: a depth that differs by less than `max_change_m`.
 
     `dither_px`, one for all pixels, is added to sources before they are rounded to pixels. Without it labels would slip
     along a surface by the same fraction of a pixel every frame.
@@ -47,15 +44,9 @@ def carried_labels(
     column, row = pixel_grid(height, width, depth_m.dtype)
     x, y = column + backward_px[..., 0], row + backward_px[..., 1]
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    length = safe_norm(rays)
-    before_m, range_m = (length * last_depth_m).reshape(-1), length * depth_m
-
-    def source(x: Float[Array, "height width"], y: Float[Array, "height width"]) -> tuple[Array, Array]:
-        at_x, at_y = jnp.clip(jnp.round(x), 0, width - 1), jnp.clip(jnp.round(y), 0, height - 1)
-        index = jnp.where(inside, at_y * width + at_x, 0.0).astype(jnp.int32)
-        before = before_m[index]
-        return index, valid & inside & (before > 0) & (jnp.abs(range_m - before) < max_change_m)
-
-    index, same = source(x + dither_px[0], y + dither_px[1])
-    _, direct = source(x, y)
-    return jnp.where(same, last_labels.reshape(-1)[index], NO_LABEL), direct
+    at_x = jnp.clip(jnp.round(x + dither_px[0]), 0, width - 1)
+    at_y = jnp.clip(jnp.round(y + dither_px[1]), 0, height - 1)
+    index = jnp.where(inside, at_y * width + at_x, 0.0).astype(jnp.int32)
+    before_m = last_depth_m.reshape(-1)[index]
+    same = valid & inside & (before_m > 0) & (jnp.abs(depth_m - before_m) < max_change_m)
+    return jnp.where(same, last_labels.reshape(-1)[index], NO_LABEL)

@@ -23,7 +23,7 @@ from .cells import NO_LABEL, NOT_NEW, births
 STATIC = 0
 """The slot of the static background."""
 
-_SAME_RANGE_M = 0.02  # noise of a range between two frames
+_SAME_DEPTH_M = 0.02  # noise of a depth between two frames
 _STAY = 0.05  # a pixel changes to another segment only if that is nearer by this, cells^2
 _START_ROUNDS = 3
 _START_FRACTION = 0.75  # of the slots that the first frame takes
@@ -71,7 +71,7 @@ class Segmenter(eqx.Module):
 
     Good values: the defaults. `side_m` 0.05 is less than the width of a forearm; `reach` (squared distance from a segment's
     centre, in sides, beyond which a pixel is not assigned to it) 2; `depth_weight` 0.5 (depth of a side counts as half a
-    side); `moved_m` 0.03; `max_speed_m_s` 2 of the range of a surface. `start_side_px` is chosen so that the first frame
+    side); `moved_m` 0.03; `max_speed_m_s` 2 of the depth of a surface. `start_side_px` is chosen so that the first frame
     takes at most 3/4 of the slots where it is None. Raises `ValueError` for values that are not positive.
     """
 
@@ -118,6 +118,10 @@ class Segmenter(eqx.Module):
             side += 1
         return side
 
+    def max_change_m(self, dt_s: Float[Array, ""]) -> Float[Array, ""]:
+        """A surface's depth changes by less than this in `dt_s`."""
+        return _SAME_DEPTH_M + self.max_speed_m_s * dt_s
+
     def init(self, height: int, width: int) -> SegmentState:
         """No segment."""
         self.start_side(height, width)
@@ -152,9 +156,8 @@ class Segmenter(eqx.Module):
         rays, depth_m, backward_px = jax.lax.stop_gradient((rays, depth_m, backward_px))
         background, dt_s, focal_px = jax.lax.stop_gradient((background, dt_s, focal_px))
         height, width = depth_m.shape
-        max_change_m = _SAME_RANGE_M + self.max_speed_m_s * dt_s
-        carried, direct = carried_labels(
-            state.labels, state.depth_m, rays, depth_m, valid, backward_px, max_change_m, state.dither_px
+        carried = carried_labels(
+            state.labels, state.depth_m, depth_m, valid, backward_px, self.max_change_m(dt_s), state.dither_px
         )
         static = self._static(state, carried, background)
         side = jnp.clip(self.side_m * focal_px / jnp.maximum(depth_m, 1e-3), self.min_side_px, self.max_side_px)
@@ -187,7 +190,7 @@ class Segmenter(eqx.Module):
         source = jnp.where(first & ~free & (jnp.arange(self.num_segments) != STATIC), NO_LABEL, source)
         is_new = source > NOT_NEW
         follows = (labels == kept) | (is_new[jnp.maximum(labels, 0)] & (carried >= 0))
-        counted = (labels > 0) & follows & direct
+        counted = (labels > 0) & follows
         labels = jnp.where(valid & static, STATIC, labels)
 
         points = [rays[..., axis] * depth_m for axis in range(3)]
@@ -270,6 +273,4 @@ class Segmenter(eqx.Module):
                 away = jnp.where(other == labels, away - _STAY, away)
                 better = (other > 0) & foreground & (away < best)
                 best, found = jnp.where(better, away, best), jnp.where(better, other, found)
-                # Else XLA computes every offset's distance anew for each of the later ones.
-                best, found = jax.lax.optimization_barrier((best, found))
         return found

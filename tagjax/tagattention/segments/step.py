@@ -71,7 +71,7 @@ class SegmentTracker(eqx.Module):
         )
         motion = segment_motion(
             camera, segments.labels, found.counted, depth_m, state.segments.depth_m, backward_px,
-            self.segmenter.num_segments,
+            self.segmenter.max_change_m(dt_s), self.segmenter.num_segments,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
         frame = SegmentFrame(
