@@ -91,10 +91,10 @@ def test_a_rigid_box_keeps_its_segments_and_its_increments_add_up() -> None:
     assert mask.sum() > 300
     assert np.isin(last[mask], own).mean() >= 0.95
     assert np.isin(last[~mask], own).sum() <= 0.02 * mask.sum()
-    # The same point of the box, 30 frames before: its own segment, or the next one where a label slipped or lay at an outline.
+    # The same point of the box, 30 frames before: its own segment, or the next one where it lay at an outline.
     before = point[mask] - np.array([0.5, 0.06, -0.2]) * 30 * DT_S
     pixel = np.rint(before[:, :2] / before[:, 2:] * 100.0 + np.array([111, 63]) / 2).astype(int)
-    assert (last[mask] == first[pixel[:, 1], pixel[:, 0]]).mean() >= 0.65
+    assert (last[mask] == first[pixel[:, 1], pixel[:, 0]]).mean() >= 0.75
 
     summed = np.sum([np.asarray(frame.increment_m) for frame in frames], axis=0)
     moved = np.sum([np.asarray(frame.motion_m) for frame in frames], axis=0)
