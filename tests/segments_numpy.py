@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
+
+from tagjax.tagattention.segments.carry import next_dither
 
 BACKGROUND = {
     "confirm_s": 1.5,
@@ -64,24 +67,18 @@ class Memory:
         return {**out, "age_s": age}
 
 
-def carried(labels, offset, last, depth, valid, rays, flow, dt, max_speed_m_s):
-    """The label of the point nearest to the end of each pixel's flow, where the range to the camera is nearly the same."""
-    height, width = depth.shape
-    length, most = np.linalg.norm(rays, axis=-1), np.array([height - 1, width - 1])
-    out, rest = np.full(depth.shape, -1), np.zeros((height, width, 2), np.float32)
-    direct = np.zeros(depth.shape, bool)
+def carried(labels, last, depth, valid, flow, max_change, dither):
+    """The label at the rounded end of each pixel's flow and dither, where the depth is nearly the same."""
+    most = np.array([depth.shape[0] - 1, depth.shape[1] - 1])
+    out = np.full(depth.shape, -1)
     for y, x in np.argwhere(valid):
         end = np.array([y, x], np.float32) + flow[y, x, ::-1]
         if (end < 0).any() or (end > most).any():
             continue
-        plain = tuple(np.rint(end).astype(int))
-        exact = tuple(np.clip(np.rint(end - offset[plain]), 0, most).astype(int))
-        for at in (plain, exact):
-            apart = abs(length[y, x] * depth[y, x] - length[at] * last[at])
-            if last[at] > 0 and apart < 0.02 + max_speed_m_s * dt:
-                out[y, x], rest[y, x] = labels[at], np.clip(np.array(at, np.float32) + offset[at] - end, -1, 1)
-                direct[y, x] |= at == plain
-    return out, rest, direct
+        at = tuple(np.clip(np.rint(end + dither[::-1]), 0, most).astype(int))
+        if last[at] > 0 and abs(depth[y, x] - last[at]) < max_change:
+            out[y, x] = labels[at]
+    return out
 
 
 def reassigned(labels, feature, side, foreground, reach):
@@ -149,14 +146,13 @@ class Labels:
     def __init__(self, settings, height: int, width: int) -> None:
         self.s, num = settings, settings.num_segments
         self.labels, self.depth = np.full((height, width), -1), np.zeros((height, width))
-        self.offset = np.zeros((height, width, 2), np.float32)
+        self.dither = np.zeros(2, np.float32)
         self.life, self.moved, self.displacement = np.zeros(num), np.zeros(num, bool), np.zeros((num, 3))
 
     def step(self, rays, depth, valid, flow, view, dt, focal):
         s, (height, width) = self.s, depth.shape
-        source_label, rest, direct = carried(
-            self.labels, self.offset, self.depth, depth, valid, rays, flow, dt, s.max_speed_m_s
-        )  # fmt: skip
+        source_label = carried(self.labels, self.depth, depth, valid, flow, 0.02 + s.max_speed_m_s * dt, self.dither)
+        self.dither = np.asarray(next_dither(jnp.asarray(self.dither)))
         static = np.zeros(depth.shape, bool)
         for at in map(tuple, np.argwhere(valid)):
             label = source_label[at]
@@ -193,8 +189,7 @@ class Labels:
             )
             labels = np.where(new > 0, new, labels)
         is_new = source > -2
-        counted = direct & (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
-        self.offset = np.where(((labels > 0) & (labels == kept))[..., None], rest, np.float32(0))
+        counted = (labels > 0) & ((labels == kept) | (is_new[np.maximum(labels, 0)] & (source_label >= 0)))
         labels = np.where(valid & static, 0, labels)
         area = np.bincount(labels[labels >= 0], minlength=s.num_segments)
         lives = (area > 0) & ~is_new
@@ -208,24 +203,26 @@ class Labels:
         self.moved |= self.lives & (np.linalg.norm(self.displacement, axis=1) > self.s.moved_m)
 
 
-def motion(rays, antennas, labels, counted, depth, last, flow, num_segments):
+def motion(rays, antennas, labels, counted, depth, last, flow, max_change, num_segments):
     """Mean change of range (antenna, segment) and of place (segment, 3), and where it is known."""
     height, width = depth.shape
+    pixel = np.array([rays[0, 1, 0] - rays[0, 0, 0], rays[1, 0, 1] - rays[0, 0, 1]])
     changes = [[] for _ in range(num_segments)]
     for y, x in np.argwhere(counted & (depth > 0) & (labels > 0)):
         u, v = float(x) + float(flow[y, x, 0]), float(y) + float(flow[y, x, 1])
         if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
             continue
         nearest = last[int(np.rint(v)), int(np.rint(u))]
-        total, mixed = 0.0, np.zeros(3)
+        total, mixed = 0.0, 0.0
         for row in {int(np.floor(v)), int(np.ceil(v))}:
             for column in {int(np.floor(u)), int(np.ceil(u))}:
                 tap = last[row, column]
                 if tap > 0 and abs(tap - nearest) < 0.03 * nearest:
                     weight = (1 - abs(u - column)) * (1 - abs(v - row))
-                    total, mixed = total + weight, mixed + weight * tap * rays[row, column]
-        if total > 1e-3:
-            now, then = depth[y, x] * rays[y, x], mixed / total
+                    total, mixed = total + weight, mixed + weight * tap
+        if total > 1e-3 and abs(depth[y, x] - mixed / total) < max_change:
+            ray = np.append(rays[y, x, :2] + pixel * flow[y, x], 1.0)
+            now, then = depth[y, x] * rays[y, x], mixed / total * ray
             ranges = [np.linalg.norm(now - a) - np.linalg.norm(then - a) for a in antennas]
             changes[labels[y, x]].append([*ranges, *(now - then)])
     known = np.array([len(c) >= 2 for c in changes])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from ...core.numerics import safe_norm
+from ...core.numerics import safe_divide, safe_norm
 from ...core.parameters import check_positive
 
 _MAX_COUNT = 100.0  # frames in a candidate's running mean
@@ -44,6 +44,7 @@ class BackgroundView(eqx.Module):
     early: Bool[Array, "height width"]  # that age is enough for a pixel without a label
     ripe: Bool[Array, "height width"]  # ... enough to be confirmed
     still: Bool[Array, "height width"]  # no apparent motion
+    lost: Float[Array, ""]  # fraction of the pixels with depth and a confirmed surface that show another; 0 without any
 
 
 class Background(eqx.Module):
@@ -104,6 +105,8 @@ class Background(eqx.Module):
         revealed = deeper_s > jnp.maximum(self.reveal_s, _REVEAL_FRAMES * dt_s)
         confirmed = jnp.where(revealed, 0.0, confirmed)
 
+        known = valid & (state.confirmed_m > 0)
+        other_surface = known & (jnp.abs(depth_m - state.confirmed_m) >= tolerance)
         view = BackgroundView(
             confirmed=valid & (confirmed > 0) & (jnp.abs(depth_m - confirmed) < tolerance),
             matched=matched,
@@ -111,6 +114,7 @@ class Background(eqx.Module):
             early=age >= self.early_s,
             ripe=age >= self.confirm_s,
             still=still,
+            lost=safe_divide(jnp.sum(other_surface, dtype=depth_m.dtype), jnp.sum(known, dtype=depth_m.dtype)),
         )
         started = state.started | jnp.any(valid)
         return BackgroundState(candidate, count, age, confirmed, deeper_s, started), view

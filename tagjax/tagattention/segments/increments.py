@@ -39,10 +39,10 @@ def pixel_sources(
     last_depth_m: Float[Array, "height width"],
     backward_px: Float[Array, "height width 2"],
 ) -> tuple[Maps, Bool[Array, "height width"]]:
-    """The point of the last frame that each pixel shows: bilinear, over taps on the surface of the nearest tap.
+    """The point of the last frame that each pixel shows: on the ray at the flow's end, at the depth of the surface there.
 
-    A surface is a depth within 3 % of the nearest tap's. Returns the points, and where the flow's source lies in the
-    picture and has depth; the points are 0 elsewhere. Differentiable in depth and flow.
+    That depth is bilinear over the taps within 3 % of the nearest tap's. Returns the points, and where the flow's source
+    lies in the picture and has depth; the points are 0 elsewhere. Differentiable in depth and flow.
     """
     height, width = last_depth_m.shape
     x, y = pixel_grid(height, width, backward_px.dtype)
@@ -69,14 +69,13 @@ def pixel_sources(
         weight[tap] = jnp.where(same, weight[tap], 0.0)
     total = weight[0] + weight[1] + weight[2] + weight[3]
     known = inside & (total > _MIN_WEIGHT)
-    # Divided before they are used: XLA keeps quotients, and computes anew what is cheap for each map that reads it.
-    weight = [one / jnp.where(known, total, 1.0) for one in weight]
-    place = []
-    for axis in range(3):
-        point = rays[..., axis].reshape(-1) * depth
-        mixed = [weight[tap] * point[at] for tap, at in enumerate(index)]
-        place.append(jnp.where(known, mixed[0] + mixed[1] + mixed[2] + mixed[3], 0.0))
-    return (place[0], place[1], place[2]), known
+    mixed = [one * depth[at] for one, at in zip(weight, index, strict=True)]
+    before_m = jnp.where(known, (mixed[0] + mixed[1] + mixed[2] + mixed[3]) / jnp.where(known, total, 1.0), 0.0)
+    # Rays are affine in the pixel: a pinhole's, with z = 1.
+    across = (rays[0, -1, 0] - rays[0, 0, 0]) / max(width - 1, 1)
+    down = (rays[-1, 0, 1] - rays[0, 0, 1]) / max(height - 1, 1)
+    ray_x, ray_y = rays[..., 0] + across * backward_px[..., 0], rays[..., 1] + down * backward_px[..., 1]
+    return (jnp.where(known, ray_x, 0.0) * before_m, jnp.where(known, ray_y, 0.0) * before_m, before_m), known
 
 
 def _range_m(
@@ -93,15 +92,17 @@ def segment_motion(
     depth_m: Float[Array, "height width"],
     last_depth_m: Float[Array, "height width"],
     backward_px: Float[Array, "height width 2"],
+    max_change_m: Float[Array, ""],
     num_segments: int,
 ) -> SegmentMotion:
     """Each segment's mean change over its `counted` pixels of known source; 0 with fewer than two of them, and in slot 0.
 
+    A source whose depth differs by `max_change_m` or more is another surface.
     Labels are constants; the gradient flows through depth and flow.
     """
     points = [camera.rays[..., axis] * depth_m for axis in range(3)]
     before, known = pixel_sources(camera.rays, last_depth_m, backward_px)
-    measured = counted & known & (depth_m > 0) & (labels > STATIC)
+    measured = counted & known & (depth_m > 0) & (jnp.abs(depth_m - before[2]) < max_change_m) & (labels > STATIC)
     ranges = [_range_m(points, antenna) - _range_m(before, antenna) for antenna in camera.antennas_m]
     changes = [*ranges, *(now - then for now, then in zip(points, before, strict=True))]
     number, *summed = slot_sums([jnp.ones_like(depth_m), *changes], measured, labels, num_segments)

@@ -17,13 +17,13 @@ from ...core.numerics import safe_norm
 from ...core.parameters import check_positive, check_positive_integers
 from ...image.warp import pixel_grid
 from .background import BackgroundView
-from .carry import carried_labels
+from .carry import carried_labels, next_dither
 from .cells import NO_LABEL, NOT_NEW, births
 
 STATIC = 0
 """The slot of the static background."""
 
-_SAME_RANGE_M = 0.02  # noise of a range between two frames
+_SAME_DEPTH_M = 0.02  # noise of a depth between two frames
 _STAY = 0.05  # a pixel changes to another segment only if that is nearer by this, cells^2
 _START_ROUNDS = 3
 _START_FRACTION = 0.75  # of the slots that the first frame takes
@@ -37,10 +37,7 @@ class SegmentState(eqx.Module):
     """The segments after a frame; a slot without a segment has area 0."""
 
     labels: Int[Array, "height width"]  # slot of each pixel; 0 = static background, -1 = none
-    offset_x_px: Float[
-        Array, "height width"
-    ]  # from a pixel to the point whose label it has: labels lie on whole pixels
-    offset_y_px: Float[Array, "height width"]
+    dither_px: Float[Array, " axis"]  # (x, y), by which the next frame's sources are shifted
     depth_m: Float[Array, "height width"]  # of that frame
     life_s: Float[Array, " segment"]  # time since birth
     displacement_m: Float[Array, "segment 3"]  # since birth
@@ -73,8 +70,8 @@ class Segmenter(eqx.Module):
     """Cuts what moves into segments and keeps their identity. Lengths in pixels are those of the working resolution.
 
     Good values: the defaults. `side_m` 0.05 is less than the width of a forearm; `reach` (squared distance from a segment's
-    centre, in sides, beyond which a pixel is not assigned to it) 1.2; `depth_weight` 0.5 (depth of a side counts as half a
-    side); `moved_m` 0.03; `max_speed_m_s` 4 of the range of a surface. `start_side_px` is chosen so that the first frame
+    centre, in sides, beyond which a pixel is not assigned to it) 2; `depth_weight` 0.5 (depth of a side counts as half a
+    side); `moved_m` 0.03; `max_speed_m_s` 2 of the depth of a surface. `start_side_px` is chosen so that the first frame
     takes at most 3/4 of the slots where it is None. Raises `ValueError` for values that are not positive.
     """
 
@@ -84,10 +81,10 @@ class Segmenter(eqx.Module):
     max_side_px: int = eqx.field(static=True, default=12)
     start_side_px: int | None = eqx.field(static=True, default=None)
     min_pixels: int = eqx.field(static=True, default=4)
-    reach: float = eqx.field(static=True, default=1.2)
+    reach: float = eqx.field(static=True, default=2.0)
     depth_weight: float = eqx.field(static=True, default=0.5)
     moved_m: float = eqx.field(static=True, default=0.03)
-    max_speed_m_s: float = eqx.field(static=True, default=4.0)
+    max_speed_m_s: float = eqx.field(static=True, default=2.0)
 
     def __check_init__(self) -> None:
         whole = ("num_segments", "min_side_px", "max_side_px", "min_pixels")
@@ -121,14 +118,17 @@ class Segmenter(eqx.Module):
             side += 1
         return side
 
+    def max_change_m(self, dt_s: Float[Array, ""]) -> Float[Array, ""]:
+        """A surface's depth changes by less than this in `dt_s`."""
+        return _SAME_DEPTH_M + self.max_speed_m_s * dt_s
+
     def init(self, height: int, width: int) -> SegmentState:
         """No segment."""
         self.start_side(height, width)
         zero = jnp.zeros(self.num_segments)
         return SegmentState(
             labels=jnp.full((height, width), NO_LABEL, jnp.int32),
-            offset_x_px=jnp.zeros((height, width)),
-            offset_y_px=jnp.zeros((height, width)),
+            dither_px=jnp.zeros(2),
             depth_m=jnp.zeros((height, width)),
             life_s=zero,
             displacement_m=jnp.zeros((self.num_segments, 3)),
@@ -156,10 +156,9 @@ class Segmenter(eqx.Module):
         rays, depth_m, backward_px = jax.lax.stop_gradient((rays, depth_m, backward_px))
         background, dt_s, focal_px = jax.lax.stop_gradient((background, dt_s, focal_px))
         height, width = depth_m.shape
-        carried, offset_x, offset_y, direct = carried_labels(
-            state.labels, state.offset_x_px, state.offset_y_px, state.depth_m,
-            rays, depth_m, valid, backward_px, _SAME_RANGE_M + self.max_speed_m_s * dt_s,
-        )  # fmt: skip
+        carried = carried_labels(
+            state.labels, state.depth_m, depth_m, valid, backward_px, self.max_change_m(dt_s), state.dither_px
+        )
         static = self._static(state, carried, background)
         side = jnp.clip(self.side_m * focal_px / jnp.maximum(depth_m, 1e-3), self.min_side_px, self.max_side_px)
         x, y = pixel_grid(height, width, depth_m.dtype)
@@ -191,8 +190,7 @@ class Segmenter(eqx.Module):
         source = jnp.where(first & ~free & (jnp.arange(self.num_segments) != STATIC), NO_LABEL, source)
         is_new = source > NOT_NEW
         follows = (labels == kept) | (is_new[jnp.maximum(labels, 0)] & (carried >= 0))
-        counted = (labels > 0) & follows & direct
-        same_point = (labels > 0) & (labels == kept)
+        counted = (labels > 0) & follows
         labels = jnp.where(valid & static, STATIC, labels)
 
         points = [rays[..., axis] * depth_m for axis in range(3)]
@@ -201,8 +199,7 @@ class Segmenter(eqx.Module):
         lives = (area > 0) & ~is_new
         after = SegmentState(
             labels=labels,
-            offset_x_px=jnp.where(same_point, offset_x, 0.0),
-            offset_y_px=jnp.where(same_point, offset_y, 0.0),
+            dither_px=next_dither(state.dither_px),
             depth_m=depth_m,
             life_s=jnp.where(lives, state.life_s + dt_s, 0.0),
             displacement_m=jnp.where(lives[:, None], state.displacement_m, 0.0),
@@ -276,6 +273,4 @@ class Segmenter(eqx.Module):
                 away = jnp.where(other == labels, away - _STAY, away)
                 better = (other > 0) & foreground & (away < best)
                 best, found = jnp.where(better, away, best), jnp.where(better, other, found)
-                # Else XLA computes every offset's distance anew for each of the later ones.
-                best, found = jax.lax.optimization_barrier((best, found))
         return found

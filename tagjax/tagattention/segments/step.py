@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -27,6 +28,9 @@ class SegmentFrame(eqx.Module):
     moved: Bool[Array, " segment"]  # was ever displaced by `labels.moved_m`
     source: Int[Array, " segment"]  # slot of the last frame that a new segment comes from, -1 = none; -2 = not new
     num_unplaced: Int[Array, ""]  # new segments that found no free slot
+    background_lost: Float[
+        Array, ""
+    ]  # fraction of the confirmed background that shows another depth: near 1, the camera moved
 
 
 class SegmentTrackerState(eqx.Module):
@@ -67,7 +71,7 @@ class SegmentTracker(eqx.Module):
         )
         motion = segment_motion(
             camera, segments.labels, found.counted, depth_m, state.segments.depth_m, backward_px,
-            self.segmenter.num_segments,
+            self.segmenter.max_change_m(dt_s), self.segmenter.num_segments,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
         frame = SegmentFrame(
@@ -82,6 +86,7 @@ class SegmentTracker(eqx.Module):
             moved=segments.moved,
             source=found.source,
             num_unplaced=found.num_unplaced,
+            background_lost=jax.lax.stop_gradient(view.lost),
         )
         return SegmentTrackerState(background, segments), frame
 
