@@ -32,9 +32,23 @@ def test_degenerate_frames_give_defined_and_finite_segments(settings: dict) -> N
     for blank in (out[0], out[5]):
         np.testing.assert_array_equal(blank.labels, -1)
         assert int(blank.num_unplaced) == 0
-    assert float(out[6].area[1:].sum()) > 0  # after a blank frame blocks again
+    assert float(out[6].area[1:].sum()) > 0
     if tracker.segmenter.num_segments < 80:
         assert sum(int(frame.num_unplaced) for frame in out) > 0
+
+
+def test_a_frame_without_depth_leaves_the_segments_as_they_are() -> None:
+    tracker = SegmentTracker(segmenter=Segmenter(num_segments=80, side_m=0.1, min_side_px=3))
+    (depth, flow), *_ = random_scene(8, 1)
+    still, nothing = np.zeros_like(flow), np.zeros_like(depth)
+    camera = pinhole(depth.shape[0], depth.shape[1], 50.0)
+    before, blank, after = run(tracker, camera, [(depth, still), (nothing, still), (depth, still)])
+    assert float(blank.area.sum()) == 0.0
+    assert int((blank.source > -2).sum()) == 0
+    kept = np.asarray(before.labels) > 0
+    assert (np.asarray(before.labels) == np.asarray(after.labels))[kept].mean() > 0.95
+    old = np.asarray(before.area) > 0
+    assert np.mean(np.asarray(after.life_s)[old] > 0) > 0.95
 
 
 def test_a_step_between_frames_at_one_time_changes_no_label() -> None:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...tracing.tracer import Camera
 from .background import Background, BackgroundState
 from .carry import on_surface
+from .cells import NO_LABEL, NOT_NEW
 from .increments import segment_motion
 from .labels import Segmenter, SegmentState
 
@@ -61,9 +62,11 @@ class SegmentTracker(eqx.Module):
     ) -> tuple[SegmentTrackerState, SegmentFrame]:
         """The next frame, `dt_s` after the last; `depth_m` is z, 0 = missing.
 
-        `backward_px` lies on the pixels of this frame and points to the last one. Only `increment_m` and `motion_m` have
+        `backward_px` lies on the pixels of this frame and points to the last one; where it is not finite it counts as 0. A
+        frame without depth has no labels, and leaves the segments as they are. Only `increment_m` and `motion_m` have
         gradients, in depth and flow.
         """
+        backward_px = jnp.where(jnp.isfinite(backward_px), backward_px, 0.0)
         valid, focal = on_surface(depth_m), focal_px(camera)
         background, view = self.background.step(state.background, depth_m, valid, backward_px, dt_s, focal)
         segments, found = self.segmenter.step(
@@ -74,21 +77,23 @@ class SegmentTracker(eqx.Module):
             self.segmenter.max_change_m(dt_s), self.segmenter.num_segments,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
+        seen = jnp.any(valid)
+        kept = jax.tree.map(lambda new, old: jnp.where(seen, new, old), segments, state.segments)
         frame = SegmentFrame(
-            labels=segments.labels,
+            labels=jnp.where(seen, segments.labels, NO_LABEL),
             increment_m=motion.increment_m,
             motion_m=motion.motion_m,
             known=motion.known,
-            centre_m=segments.centre_m,
-            area=segments.area,
-            life_s=segments.life_s,
-            displacement_m=segments.displacement_m,
-            moved=segments.moved,
-            source=found.source,
+            centre_m=kept.centre_m,
+            area=jnp.where(seen, kept.area, 0.0),
+            life_s=kept.life_s,
+            displacement_m=kept.displacement_m,
+            moved=kept.moved,
+            source=jnp.where(seen, found.source, NOT_NEW),
             num_unplaced=found.num_unplaced,
             background_lost=jax.lax.stop_gradient(view.lost),
         )
-        return SegmentTrackerState(background, segments), frame
+        return SegmentTrackerState(background, kept), frame
 
 
 def focal_px(camera: Camera) -> Float[Array, ""]:
