@@ -70,7 +70,7 @@ class Segmenter(eqx.Module):
     """Cuts what moves into segments and keeps their identity. Lengths in pixels are those of the working resolution.
 
     Good values: the defaults. `side_m` 0.05 is less than the width of a forearm; `reach` (squared distance from a segment's
-    centre, in sides, beyond which a pixel is not assigned to it) 2; `depth_weight` 0.5 (depth of a side counts as half a
+    centre, in sides, beyond which a pixel is not assigned to it) 2, up to 4 alike; `depth_weight` 0.5 (depth of a side counts as half a
     side); `moved_m` 0.03; `max_speed_m_s` 2 of the depth of a surface. `start_side_px` is chosen so that the first frame
     takes at most 3/4 of the slots where it is None. Raises `ValueError` for values that are not positive.
     """
@@ -164,8 +164,6 @@ class Segmenter(eqx.Module):
         x, y = pixel_grid(height, width, depth_m.dtype)
         log_depth = jnp.log(jnp.where(depth_m > 0, depth_m, 1.0))
         feature = x, y, self.depth_weight * focal_px * log_depth
-        # What many later maps read is computed once, not anew in each of their loops.
-        carried, static, side, feature = jax.lax.optimization_barrier((carried, static, side, feature))
 
         foreground = valid & ~static
         first = ~jnp.any(state.labels >= 0)
