@@ -145,7 +145,7 @@ class CarryingBody(eqx.Module):
             top = jnp.max(level, initial=-1e30)
             place = size * jnp.exp(level - top)
             place = place / (jnp.sum(place) + _TINY)
-            peak = jnp.argmax(near @ place)
+            peak = jnp.argmax(close.astype(place.dtype) @ place)  # the largest sum, not mean: a lone sliver is no body
             reach_m = 2.0 * self.neighbour_m.value
             start = place * jnp.exp(_distance_log(centre, centre[peak], jnp.square(reach_m)))
             start = start / (jnp.sum(start) + _TINY)
