@@ -26,6 +26,7 @@ class BodyState(eqx.Module):
 
     past: PastMotion
     membership: Float[Array, "tag segment"]  # log odds that the segment belongs to the tag's body, remembered
+    fastest_m_s: Float[Array, " segment"]  # highest speed of late, remembered
 
 
 class Bodies(eqx.Module):
@@ -48,8 +49,8 @@ class CarryingBody(eqx.Module):
     neighbour_m: Positive  # segments within this distance are neighbours
     neighbours: Positive  # log odds of a segment whose neighbours are all members (minus it: all others)
     extent: Positive  # a segment so many standard deviations of the body from its middle has log odds lower by 0.5
-    moving_m_s: Positive  # a segment slower than this is no place for a tag that moves
-    memory_s: Positive  # of the membership
+    moving_m_s: Positive  # a segment that has been slower than this of late is no place for a tag that moves
+    memory_s: Positive  # of membership and speed
     num_active: int = eqx.field(static=True)  # segments that are looked at: the fastest, and remembered members
     num_rounds: int = eqx.field(static=True)
     speed_s: float = eqx.field(static=True)  # time over which speeds are measured
@@ -94,7 +95,8 @@ class CarryingBody(eqx.Module):
     def init(self, num_tags: int, num_segments: int) -> BodyState:
         """The state before the first frame."""
         span_s = max(self.speed_s, *self.rigid.lags_s)
-        return BodyState(PastMotion.nothing(num_segments, span_s=span_s), jnp.zeros((num_tags, num_segments)))
+        past = PastMotion.nothing(num_segments, span_s=span_s)
+        return BodyState(past, jnp.zeros((num_tags, num_segments)), jnp.zeros(num_segments))
 
     def step(
         self,
@@ -122,8 +124,13 @@ class CarryingBody(eqx.Module):
         moved_m, time_s = past.since(self.speed_s, displacement_m, life_s, now_s)
         # A segment's first frames show more noise than motion: half the time counts at least.
         speed_m_s = safe_norm(moved_m) / jnp.maximum(time_s, 0.5 * self.speed_s)
+        # What paused a moment ago may still carry the tag.
+        keep = jnp.exp(-(now_s - since_s) / self.memory_s.value)
+        source = jnp.where(newborn, newborn_source, jnp.arange(num_segments, dtype=newborn_source.dtype))
+        before_m_s = jnp.where(source > 0, state.fastest_m_s[jnp.maximum(source, 0)], 0.0)
+        fastest_m_s = jnp.maximum(speed_m_s, keep * before_m_s)
         exists = (area > 0) & (jnp.arange(num_segments) > 0)
-        rank = jnp.where(exists, speed_m_s + 0.1 * jnp.max(membership, axis=0, initial=0.0), -jnp.inf)
+        rank = jnp.where(exists, fastest_m_s + 0.1 * jnp.max(membership, axis=0, initial=0.0), -jnp.inf)
         _, active = jax.lax.top_k(jax.lax.stop_gradient(rank), min(self.num_active, num_segments))
         there = exists[active]
         centre, size = centre_m[active], jnp.where(there, area[active], 0.0)
@@ -136,8 +143,7 @@ class CarryingBody(eqx.Module):
         long_enough = [elapsed >= 0.8 * lag for (_, elapsed), lag in zip(lagged, self.rigid.lags_s, strict=True)]
         known = jnp.stack([enough[active] & there for enough in long_enough])
         width = 0.3 * self.moving_m_s.value
-        moving = jax.nn.log_sigmoid((speed_m_s[active] - self.moving_m_s.value) / width)
-        keep = jnp.exp(-(now_s - since_s) / self.memory_s.value)
+        moving = jax.nn.log_sigmoid((fastest_m_s[active] - self.moving_m_s.value) / width)
 
         def of_tag(own: Float[Array, " active"], memory: Float[Array, " active"]) -> tuple[Array, Array, Array]:
             smooth = near @ own
@@ -174,7 +180,7 @@ class CarryingBody(eqx.Module):
         shape = membership.shape
         # Segments that are not looked at forget as well.
         membership = (keep * membership).at[:, active].set(jnp.where(there[None], remembered, 0.0))
-        return BodyState(past, membership), Bodies(
+        return BodyState(past, membership, fastest_m_s), Bodies(
             log_odds=jnp.full(shape, -30.0).at[:, active].set(jnp.where(there[None], log_odds, -30.0)),
             place=jnp.zeros(shape).at[:, active].set(jnp.where(there[None], place, 0.0)),
             speed_m_s=speed_m_s,
