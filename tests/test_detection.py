@@ -47,7 +47,9 @@ def test_a_tag_is_lost_without_reads_however_sure_it_was():
     sure = [jnp.array([500.0]), jnp.array([-500.0])]
     assert bool(detection.detected(detection.confidence(*sure, reads))[0])
     for frame in range(150):  # five seconds
-        reads = detection.received(reads, arrivals([0], [0.0], [False]), jnp.asarray(frame / 30), jnp.asarray((frame + 1) / 30))
+        reads = detection.received(
+            reads, arrivals([0], [0.0], [False]), jnp.asarray(frame / 30), jnp.asarray((frame + 1) / 30)
+        )
     assert float(detection.confidence(*sure, reads)[0]) < 0.1
 
 

@@ -63,9 +63,7 @@ def test_a_read_adds_what_scipy_says_also_to_phasors_of_thousands():
     weight = rng.uniform(0.5, 80, 200).astype(np.float32)
     phase = ((angle + rng.normal(0, 0.2, 200)) / 2).astype(np.float32)
     reader = ReaderModel(outlier=0.05)
-    found, real, imaginary = reader.add_read(
-        *(jnp.asarray(each) for each in (phasor.real, phasor.imag, weight, phase))
-    )
+    found, real, imaginary = reader.add_read(*(jnp.asarray(each) for each in (phasor.real, phasor.imag, weight, phase)))
     own = weight.astype(float) * np.exp(2j * phase.astype(float))
     before, after = np.abs(phasor.astype(complex)), np.abs(phasor.astype(complex) + own)
     gain = (after - before - weight) + np.log(

@@ -74,12 +74,15 @@ def test_steps_and_places_are_those_of_the_objects(traced, clip):
 
 
 def test_a_place_without_a_tag_changes_nothing_and_is_never_detected(clip, traced):
-    wider = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf[:, :1]], axis=1), (clip.frames.radio, clip.frames.reads))
+    wider = jax.tree.map(
+        lambda leaf: jnp.concatenate([leaf, leaf[:, :1]], axis=1), (clip.frames.radio, clip.frames.reads)
+    )
     present = jnp.concatenate([clip.frames.present, jnp.zeros((60, 1), bool)], axis=1)
     frames = eqx.tree_at(lambda f: (f.radio, f.reads, f.present), clip.frames, (*wider, present))
     found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
     np.testing.assert_allclose(found.mask[:, :2], traced.mask, atol=1e-5)
-    assert not bool(jnp.any(found.detected[:, 2])) and float(jnp.max(found.confidence[:, 2])) == 0.0
+    assert not bool(jnp.any(found.detected[:, 2]))
+    assert float(jnp.max(found.confidence[:, 2])) == 0.0
 
 
 def test_detections_end_with_the_reads(clip):
@@ -121,9 +124,7 @@ def test_a_batch_is_a_loop(clip, traced):
 
 def test_every_stage_has_a_finite_gradient(clip):
     frames = jax.tree.map(lambda leaf: leaf[:24], clip.frames)
-    tracer = eqx.tree_at(
-        lambda t: t.attention, TRACER, AttentionEvidence(), is_leaf=lambda leaf: leaf is None
-    )
+    tracer = eqx.tree_at(lambda t: t.attention, TRACER, AttentionEvidence(), is_leaf=lambda leaf: leaf is None)
 
     @eqx.filter_jit
     @eqx.filter_grad
@@ -134,7 +135,8 @@ def test_every_stage_has_a_finite_gradient(clip):
 
     found, flow = gradient((tracer, frames.backward_px))
     values = found.physical()
-    assert all(np.isfinite(value) for value in values.values()) and bool(jnp.all(jnp.isfinite(flow)))
+    assert all(np.isfinite(value) for value in values.values())
+    assert bool(jnp.all(jnp.isfinite(flow)))
     moved = {name.split(".")[0] for name, value in values.items() if value != 0}
     assert {"reader", "dwell", "attention", "body", "detection"} <= moved
     assert bool(jnp.any(flow != 0))

@@ -42,7 +42,9 @@ class ReaderModel(eqx.Module):
     floor_rad: Positive  # thermal noise at a high RSSI
     spread_rad: Positive  # standard deviation beside thermal noise: reflections, errors of the motion
     still_spread_rad: Positive  # the same of a tag that stays in place
-    drift_m: Positive  # variance of a motion's error, m^2, for each metre: reflections change, and motions are not exact
+    drift_m: (
+        Positive  # variance of a motion's error, m^2, for each metre: reflections change, and motions are not exact
+    )
     outlier: Fraction  # probability of a read with any phase
     modulo_pi: bool = eqx.field(static=True)  # phases count modulo pi, so that pi flips do not matter
 
@@ -79,9 +81,7 @@ class ReaderModel(eqx.Module):
         by_rssi = jnp.exp(jnp.log(10.0) * (self.slope_per_dbm * rssi + self.intercept))
         return jnp.sqrt(jnp.square(self.floor_rad.value) + jnp.square(by_rssi))
 
-    def concentration(
-        self, rssi_dbm: Float[Array, "*#batch"], still: Bool[Array, "*#batch"]
-    ) -> Float[Array, "*batch"]:
+    def concentration(self, rssi_dbm: Float[Array, "*#batch"], still: Bool[Array, "*#batch"]) -> Float[Array, "*batch"]:
         """w = 1 / (m^2 variance) of reads; where `still`, `still_spread_rad` is the spread beside thermal noise."""
         spread = jnp.where(still, self.still_spread_rad.value, self.spread_rad.value)
         return 1.0 / (self.multiple**2 * (jnp.square(self.thermal_rad(rssi_dbm)) + jnp.square(spread)))

@@ -7,6 +7,7 @@ is none. So no tag that appears compiles anything, unless it is the first beyond
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -18,6 +19,7 @@ from jaxtyping import Array, Int
 
 from ..core.camera import Intrinsics
 from ..core.geometry import pixel_rays, range_to_depth
+from ..radio.arrivals import Arrivals
 from ..radio.reads import PhaseReads, RadioWindow
 from ..recording import TagReads
 from .arrivals import frame_arrivals
@@ -27,6 +29,7 @@ from .tracer import Camera, Frame
 MAX_TAGS = 64
 """Places for tags; beyond, the tag whose last read is oldest gives way."""
 
+_NUM_PLACES = (1, 2, 4, 8, 16, 32, 64)
 _REBASE_S = 1024.0  # times on the device are float32 seconds from an origin, which is moved so often
 
 
@@ -58,7 +61,8 @@ class LiveTracer:
 
     `flow` gives the flow from the first picture to the second, (height, width, 2) pixels; `stride` keeps every n-th pixel;
     `antennas` are the numbers (from 1) of those at `antennas_m`, of which reads are used. A tag that has not been read for
-    `forget_s` gives its place to a new one. Raises `ValueError` for a stride below 1.
+    `forget_s` gives its place to a new one; there are `num_places` from the start. Raises `ValueError` for a stride below 1,
+    and for a number of places that is not 1, 2, 4, ..., 64.
     """
 
     def __init__(
@@ -72,10 +76,13 @@ class LiveTracer:
         antennas: tuple[int, ...] = (1,),
         depth_kind: str = "depth",
         num_reads: int = MAX_ARRIVALS,
+        num_places: int = 1,
         forget_s: float = 30.0,
     ):
         if stride < 1:
             raise ValueError(f"stride is {stride}; expected at least 1 (every n-th pixel is kept).")
+        if num_places not in _NUM_PLACES:
+            raise ValueError(f"num_places is {num_places}; expected one of {', '.join(map(str, _NUM_PLACES))}.")
         self._tracer, self._intrinsics, self._flow, self._stride = tracer, intrinsics, flow, stride
         self._antennas, self._range = antennas, depth_kind == "range"
         self._num_reads, self._forget_ns = num_reads, int(forget_s * 1e9)
@@ -84,7 +91,7 @@ class LiveTracer:
             rays=jnp.asarray(pixel_rays(intrinsics.scaled(stride))), antennas_m=jnp.asarray(chosen, jnp.float32)
         )
         self._no_flow = jnp.zeros((*self._camera.rays.shape[:2], 2))
-        self._places: list[str | None] = [None]
+        self._places: list[str | None] = [None] * num_places
         self._last_read_ns: dict[str, int] = {}
         self._state: Any = None
         self._colour: np.ndarray | None = None
@@ -118,17 +125,7 @@ class LiveTracer:
             reads, epcs, self._antennas, np.array([time_ns]), self._origin_ns, self._num_reads,
             since_ns=self._time_ns if not first else None,
         )  # fmt: skip
-        num_tags, num_antennas = len(epcs), len(self._antennas)
-        frame = Frame(
-            time_s=jnp.asarray((time_ns - self._origin_ns) * 1e-9, jnp.float32),
-            depth_m=jnp.asarray(depth_m, jnp.float32),
-            backward_px=jnp.asarray(backward_px, jnp.float32),
-            forward_px=self._no_flow,
-            radio=RadioWindow(jnp.zeros((num_tags, num_antennas, 2)), jnp.full((num_tags, num_antennas, 2), jnp.inf)),
-            reads=_no_reads(num_tags, num_antennas),
-            arrivals=jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), arrivals),
-            present=jnp.asarray([epc is not None for epc in self._places]),
-        )
+        frame = self._frame((time_ns - self._origin_ns) * 1e-9, depth_m, backward_px, arrivals)
         if first:
             self._state = _init(self._tracer, self._camera, frame)
         self._state, trace = _follow((self._tracer, self._camera, frame), self._state)
@@ -138,6 +135,34 @@ class LiveTracer:
             self._origin_ns += int(_REBASE_S * 1e9)
         places = {epc: place for place, epc in enumerate(self._places) if epc is not None}
         return LiveFrame(time_ns, places, trace, int(unused.num_dropped.sum()))
+
+    def warm_up(self) -> float:
+        """Compile the tracer's step on a blank frame, before the first frame comes; the seconds that it took."""
+        begun = time.perf_counter()
+        height, width, _ = self._camera.rays.shape
+        arrivals, _ = frame_arrivals(
+            TagReads.empty(), [f"\0{place}" for place in range(len(self._places))], self._antennas, np.array([0]), 0,
+            self._num_reads,
+        )  # fmt: skip
+        frame = self._frame(
+            0.0, np.zeros((height, width), np.float32), np.zeros((height, width, 2), np.float32), arrivals
+        )
+        state = _init(self._tracer, self._camera, frame)
+        jax.block_until_ready(_follow((self._tracer, self._camera, frame), state))
+        return time.perf_counter() - begun
+
+    def _frame(self, time_s: float, depth_m: np.ndarray, backward_px: np.ndarray, arrivals: Arrivals) -> Frame:
+        num_tags, num_antennas = len(self._places), len(self._antennas)
+        return Frame(
+            time_s=jnp.asarray(time_s, jnp.float32),
+            depth_m=jnp.asarray(depth_m, jnp.float32),
+            backward_px=jnp.asarray(backward_px, jnp.float32),
+            forward_px=self._no_flow,
+            radio=RadioWindow(jnp.zeros((num_tags, num_antennas, 2)), jnp.full((num_tags, num_antennas, 2), jnp.inf)),
+            reads=_no_reads(num_tags, num_antennas),
+            arrivals=jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), arrivals),
+            present=jnp.asarray([epc is not None for epc in self._places]),
+        )
 
     def _admit(self, reads: TagReads, time_ns: int) -> None:
         """Give every tag that was read a place."""

@@ -19,7 +19,6 @@ from jaxtyping import Array, Float, Int
 
 from ...core.constrained import Positive
 from ...radio.arrivals import Arrivals
-from ...radio.phase import distance_to_phase
 from ...radio.reader_model import ReaderModel
 
 _SHORTEST_FRAME_S = 1e-6

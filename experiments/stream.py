@@ -1,0 +1,39 @@
+"""Trace a recording as if its sensors were running; the last line is the result as JSON.
+
+python -m experiments.stream recording=a.zarr                            # in real time: frames that are late are dropped
+python -m experiments.stream recording=a.zarr replay.real_time=false      # as fast as it goes, every frame
+python -m experiments.stream recording=a.zarr replay.real_time=false replay.loops=100
+
+frames.jsonl has a line a frame: time, and for each tag box, place, confidence. Ctrl-C ends the stream and keeps all lines.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from .command import checked, command, print_result
+
+
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
+    from rich.console import Console
+
+    from tagjax.evaluation.stream import StreamConfig, run_stream
+
+    progress, console = values.pop("progress"), Console(markup=False)
+    config = checked(StreamConfig, values, folder)
+    with console.status("compiling") as status:
+        summary = run_stream(config, folder, on_frame=status.update if progress else None)
+    console.print(
+        f"{summary['frames']} frames at {summary['frames_per_s']:.1f}/s, {summary['dropped_frames']} dropped; a frame took "
+        f"{summary['process_ms']['p50']:.1f} ms (median), {summary['process_ms']['p99']:.1f} ms (99 %); its result came "
+        f"{summary['latency_ms']['p50']:.1f} ms after it (median). frames.jsonl and stream.json are in {folder}",
+        soft_wrap=True,
+        highlight=False,
+    )
+    print_result(summary)
+
+
+if __name__ == "__main__":
+    main()
