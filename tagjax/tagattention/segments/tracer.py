@@ -5,7 +5,8 @@ A frame passes through them in this order:
 1. `segments`: depth and flow -> persistent segments and each one's motion (shared by all tags);
 2. `dwell`, with the `reader`'s noise model: this frame's reads -> evidence for each tag at each segment;
 3. `body`: evidence and motion in space -> which segments belong to the body that carries the tag;
-4. `detection`: evidence for that body, and how recent it is -> the probability that the tag is on it.
+4. `hidden`: the last body -> its evidence where it comes out again, and whether the tag is out of view;
+5. `detection`: evidence for that body, and how recent it is -> the probability that the tag is on it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody
 from .detection import Detection
 from .dwell import DwellEvidence, DwellState
+from .hidden import HiddenBody, HiddenState
 from .labels import STATIC
 from .outline import (
     dense_masks,
@@ -46,6 +48,7 @@ class TagAttentionState(eqx.Module):
     dwell: DwellState
     attention: AttentionState | None
     body: BodyState
+    hidden: HiddenState | None
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
 
 
@@ -66,30 +69,15 @@ class SegmentTrace(eqx.Module):
 
 
 class TagAttention(AbstractTracer):
-    """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values."""
+    """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values; None is a stage that is off."""
 
-    segments: SegmentTracker
-    reader: ReaderModel
-    dwell: DwellEvidence
-    attention: AttentionEvidence | None
-    body: CarryingBody
-    detection: Detection
-
-    def __init__(
-        self,
-        segments: SegmentTracker | None = None,
-        reader: ReaderModel | None = None,
-        dwell: DwellEvidence | None = None,
-        attention: AttentionEvidence | None = None,
-        body: CarryingBody | None = None,
-        detection: Detection | None = None,
-    ) -> None:
-        self.segments = SegmentTracker() if segments is None else segments
-        self.reader = ReaderModel() if reader is None else reader
-        self.dwell = DwellEvidence() if dwell is None else dwell
-        self.attention = attention
-        self.body = CarryingBody() if body is None else body
-        self.detection = Detection() if detection is None else detection
+    segments: SegmentTracker = eqx.field(default_factory=SegmentTracker)
+    reader: ReaderModel = eqx.field(default_factory=ReaderModel)
+    dwell: DwellEvidence = eqx.field(default_factory=DwellEvidence)
+    attention: AttentionEvidence | None = None
+    body: CarryingBody = eqx.field(default_factory=CarryingBody)
+    hidden: HiddenBody | None = eqx.field(default_factory=HiddenBody)
+    detection: Detection = eqx.field(default_factory=Detection)
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         """The state before the first frame."""
@@ -102,6 +90,7 @@ class TagAttention(AbstractTracer):
             dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
             attention=self._no_attention(frame, num_segments),
             body=self.body.init(num_tags, num_segments),
+            hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
             num_reads=jnp.zeros(num_tags),
         )
 
@@ -115,6 +104,10 @@ class TagAttention(AbstractTracer):
         dwell, log_likelihood = self.dwell.step(
             self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
         )
+        hidden = state.hidden
+        if self.hidden is not None and hidden is not None:
+            log_likelihood = self.hidden.inherited(hidden, log_likelihood, found.centre_m, found.source > -2)
+            dwell = eqx.tree_at(lambda d: d.log_likelihood, dwell, log_likelihood)
         attention = state.attention
         if self.attention is not None and attention is not None:
             attention, agreed = self.attention.step(
@@ -134,13 +127,20 @@ class TagAttention(AbstractTracer):
             return safe_divide(weight @ values, jnp.broadcast_to(total[:, None], (total.shape[0], values.shape[-1])))
 
         body_nats = safe_divide(jnp.sum(weight * log_likelihood, axis=1), total)
+        body_nats = jnp.where(total > 0, body_nats, -1e4)
+        hides = jnp.zeros(total.shape, bool)
+        if self.hidden is not None and hidden is not None:
+            dt_s = now_s - since_s
+            velocity = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
+            kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
+            hidden, hides = self.hidden.step(hidden, body_nats, mean(found.centre_m), velocity, kept, dt_s)
         num_reads = self.detection.received(state.num_reads, frame.arrivals, since_s, now_s)
         confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
         labels = filled_labels(found.labels, frame.depth_m)
         num_segments = found.area.shape[0]
         member = membership > 0.5
         box_px = joined_boxes(segment_boxes(labels, num_segments), member)
-        confidence = jnp.where(frame.present & jnp.any(member, axis=1), confidence, 0.0)
+        confidence = jnp.where(frame.present & jnp.any(member, axis=1) & ~hides, confidence, 0.0)
         out = SegmentTrace(
             labels=labels,
             membership=membership,
@@ -154,7 +154,7 @@ class TagAttention(AbstractTracer):
             confidence=confidence,
             detected=self.detection.detected(confidence),
         )
-        return TagAttentionState(now_s, segments, dwell, attention, body, num_reads), out
+        return TagAttentionState(now_s, segments, dwell, attention, body, hidden, num_reads), out
 
     def _no_attention(self, frame: Frame, num_segments: int) -> AttentionState | None:
         if self.attention is None:
