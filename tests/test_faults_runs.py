@@ -332,6 +332,7 @@ def test_every_file_is_written_whole_or_not_at_all() -> None:
 
 SMALL_FILES = """
 import resource, sys
+sys.dont_write_bytecode = True  # Python 3.11 keeps .pyc files of which only a part could be written
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)), resource.RLIM_INFINITY))
 """
 """The start of a program that the system lets write no greater file; part of the file is written, as on a full disk."""
