@@ -68,7 +68,8 @@ def test_shrinking_turns_the_body_less():
         for shrink in (0.0, 0.003, 0.03, 3.0)
     ]
     assert angles[0] == pytest.approx(0.5, abs=1e-3)
-    assert angles == sorted(angles, reverse=True) and angles[-1] < 0.01
+    assert angles == sorted(angles, reverse=True)
+    assert angles[-1] < 0.01
 
 
 def test_the_gradient_of_the_log_ratio_agrees_with_finite_differences():
@@ -91,14 +92,16 @@ def test_the_gradient_of_the_log_ratio_agrees_with_finite_differences():
 
 
 def test_the_log_ratio_is_that_of_two_normal_distributions():
-    rigid = RigidMotion(lags_s=(0.3,), noise_m=0.005, noise_fraction=0.1, other_fraction=0.7, least=99.0, most=99.0)
+    rigid = RigidMotion(
+        lags_s=(0.3,), noise_m=0.005, noise_fraction=0.1, travel_per_m=0.5, other_fraction=0.7, least=99.0, most=99.0
+    )
     before = jnp.asarray(cloud(5, 6)[0], jnp.float32)
     after = before + jnp.array([[0.1, 0.0, 0.0]])
     after = after.at[5].add(jnp.array([0.0, 0.03, 0.0]))
     weight = jnp.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
     ratio = rigid.log_ratio(weight, before[None], jnp.ones((1, 6), bool), after)
     moved = np.array([0.1, np.hypot(0.1, 0.03)])
-    inside = 0.005**2 + (0.1 * moved) ** 2
+    inside = 0.005**2 + (0.1 * moved) ** 2 + (0.5 * 0.1**2) ** 2
     outside = inside + (0.7 * moved) ** 2
     expected = 1.5 * np.log(outside / inside) - 0.5 * np.array([0.0, 0.03]) ** 2 * (1 / inside - 1 / outside)
     np.testing.assert_allclose(ratio[jnp.array([0, 5])], expected, rtol=2e-3)
@@ -173,8 +176,11 @@ def test_the_body_is_the_rigid_one_at_the_place_of_the_tag():
     evidence = jnp.zeros((2, 21)).at[0, 4].set(60.0).at[1, 17].set(60.0)
     _, bodies = found(CarryingBody(), evidence, scene())
     member = np.asarray(bodies.log_odds) > 0
-    assert member[0, 1:9].all() and not member[0, 9:].any() and not member[0, 0]
-    assert member[1, 15:].all() and not member[1, :15].any()
+    assert member[0, 1:9].all()
+    assert not member[0, 9:].any()
+    assert not member[0, 0]
+    assert member[1, 15:].all()
+    assert not member[1, :15].any()
     np.testing.assert_allclose(np.sum(bodies.place, axis=1), 1.0, atol=1e-5)
 
 
@@ -201,7 +207,8 @@ def test_nothing_that_moves_and_no_tag_are_defined():
     _, bodies = stage.step(
         state, jnp.zeros((1, 21)), jnp.zeros((21, 3)), empty, empty, jnp.zeros((21, 3)), source, jnp.zeros(()), jnp.zeros(())
     )  # fmt: skip
-    assert float(jnp.max(bodies.log_odds)) < -20 and float(jnp.sum(bodies.place)) == 0.0
+    assert float(jnp.max(bodies.log_odds)) < -20
+    assert float(jnp.sum(bodies.place)) == 0.0
 
 
 def test_membership_moves_on_with_the_place():
@@ -217,7 +224,8 @@ def test_membership_moves_on_with_the_place():
         frames[29][2], now_s,
     )  # fmt: skip
     member = np.asarray(bodies.log_odds)[0] > 0
-    assert member[15:].all() and not member[:15].any()
+    assert member[15:].all()
+    assert not member[:15].any()
 
 
 def test_a_newborn_segment_inherits_the_membership_of_its_source():
@@ -235,7 +243,8 @@ def test_a_newborn_segment_inherits_the_membership_of_its_source():
         state, evidence, centre, area, life_s, displacement, source, frames[29][2], now_s
     )  # fmt: skip
     assert float(bodies.log_odds[0, 20]) > 0
-    assert float(after.membership[0, 20]) > 1.0 and abs(float(after.membership[0, 19])) < 0.5
+    assert float(after.membership[0, 20]) > 1.0
+    assert abs(float(after.membership[0, 19])) < 0.5
 
 
 def test_gradients_reach_evidence_motion_and_parameters():
