@@ -92,14 +92,16 @@ def test_the_gradient_of_the_log_ratio_agrees_with_finite_differences():
 
 
 def test_the_log_ratio_is_that_of_two_normal_distributions():
-    rigid = RigidMotion(lags_s=(0.3,), noise_m=0.005, noise_fraction=0.1, other_fraction=0.7, least=99.0, most=99.0)
+    rigid = RigidMotion(
+        lags_s=(0.3,), noise_m=0.005, noise_fraction=0.1, travel_per_m=0.5, other_fraction=0.7, least=99.0, most=99.0
+    )
     before = jnp.asarray(cloud(5, 6)[0], jnp.float32)
     after = before + jnp.array([[0.1, 0.0, 0.0]])
     after = after.at[5].add(jnp.array([0.0, 0.03, 0.0]))
     weight = jnp.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
     ratio = rigid.log_ratio(weight, before[None], jnp.ones((1, 6), bool), after)
     moved = np.array([0.1, np.hypot(0.1, 0.03)])
-    inside = 0.005**2 + (0.1 * moved) ** 2
+    inside = 0.005**2 + (0.1 * moved) ** 2 + (0.5 * 0.1**2) ** 2
     outside = inside + (0.7 * moved) ** 2
     expected = 1.5 * np.log(outside / inside) - 0.5 * np.array([0.0, 0.03]) ** 2 * (1 / inside - 1 / outside)
     np.testing.assert_allclose(ratio[jnp.array([0, 5])], expected, rtol=2e-3)

@@ -6,6 +6,8 @@ from .body import CarryingBody as CarryingBody
 from .detection import Detection as Detection
 from .dwell import DwellEvidence as DwellEvidence
 from .labels import Segmenter as Segmenter
+from .place_memory import PlaceMemory as PlaceMemory
+from .place_memory import PlaceState as PlaceState
 from .rigid import RigidMotion as RigidMotion
 from .step import SegmentFrame as SegmentFrame
 from .step import SegmentTracker as SegmentTracker
@@ -13,3 +15,7 @@ from .step import SegmentTrackerState as SegmentTrackerState
 from .tracer import SegmentTrace as SegmentTrace
 from .tracer import TagAttention as TagAttention
 from .tracer import TagAttentionState as TagAttentionState
+from .travel import Pooling as Pooling
+from .travel import TravellingTogether as TravellingTogether
+from .travel import TravelState as TravelState
+from .whole import WholeBody as WholeBody

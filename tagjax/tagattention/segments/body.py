@@ -61,7 +61,7 @@ class CarryingBody(eqx.Module):
         *,
         temperature_nats: float = 8.0,
         fit_nats: float = 15.0,
-        evidence_nats: float = 20.0,
+        evidence_nats: float = 60.0,
         most_against: float = 4.0,
         prior: float = -1.0,
         neighbour_m: float = 0.08,
@@ -114,13 +114,14 @@ class CarryingBody(eqx.Module):
 
         `evidence` is that of the reads for a tag at a segment against one at rest, nats; `area` in pixels, 0 for a slot
         without segment; slot 0 is the static background. `newborn_source` is -2 for a segment that is not newborn, else
-        the slot it comes from, or -1.
+        the slot it comes from, or -1. Displacement and life of a newborn segment go on from those of the slot it comes from,
+        as those of `Travel` do.
         """
         num_segments = area.shape[0]
         newborn = newborn_source > -2
         inherited = jnp.where((newborn_source > 0)[None], state.membership[:, jnp.maximum(newborn_source, 0)], 0.0)
         membership = jnp.where(newborn[None], inherited, state.membership)
-        past = state.past.add(displacement_m, newborn, now_s)
+        past = state.past.inherited(newborn_source).add(displacement_m, newborn & (newborn_source <= 0), now_s)
         moved_m, time_s = past.since(self.speed_s, displacement_m, life_s, now_s)
         # A segment's first frames show more noise than motion: half the time counts at least.
         speed_m_s = safe_norm(moved_m) / jnp.maximum(time_s, 0.5 * self.speed_s)

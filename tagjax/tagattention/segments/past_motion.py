@@ -48,6 +48,13 @@ class PastMotion(eqx.Module):
             span_s=self.span_s,
         )
 
+    def inherited(self, newborn_source: Int[Array, " segment"]) -> PastMotion:
+        """With the past of new segments that of their sources (slots above 0; -2 = not new), else nothing."""
+        at, has = jnp.maximum(newborn_source, 0), newborn_source > 0
+        past = jnp.where(has[None, :, None], self.displacement_m[:, at], self.displacement_m)
+        none = (newborn_source > -2) & ~has
+        return PastMotion(jnp.where(none[None, :, None], 0.0, past), self.time_s, self.newest, self.span_s)
+
     def since(
         self,
         lag_s: float,

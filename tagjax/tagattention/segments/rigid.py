@@ -6,7 +6,8 @@ A body moves by one rotation and translation. With the weights w of segments, th
 
 solved in closed form by the unit quaternion that maximises q^T N q (Horn, Journal of the Optical Society of America A,
 1987). A segment whose residual r = y - R x - t is small against its displacement belongs to the body: the log ratio of two
-normal distributions of r, with the variances of the flow's errors and of other motion.
+normal distributions of r, with the variances of the flow's errors and of other motion. What travels far together is one body
+even where its parts move against each other, as limbs do: the first variance grows with what the body travels.
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ class RigidMotion(eqx.Module):
     """Log ratio of each segment's motion, as part of a body against other motion, over several time lags.
 
     The defaults were chosen on simulated training recordings of hand-held objects at 2 m. There the residuals of an
-    object's own segments are 4 to 10 mm over half a second, those of the arm that holds it 30 to 130 mm.
+    object's own segments are 4 to 10 mm over half a second, those of the arm that holds it 30 to 130 mm. A larger
+    `travel_per_m` (0.8) takes in more of the limbs of walking people, and more of the arms that hold objects.
     """
 
     lags_s: tuple[float, ...] = eqx.field(static=True)  # motions over these times are compared
     noise_m: Positive  # standard deviation of a residual for a body at rest
     noise_fraction: Positive  # the same as a fraction of the displacement: errors of the flow
+    travel_per_m: Positive  # the same, times the square of what the body travels: parts that hang together move
     other_fraction: Positive  # the same of segments that do not belong to the body
     most: Positive  # a lag adds at most this log ratio, nats: its errors are common to many segments
     least: Positive  # and at least minus this
@@ -44,6 +47,7 @@ class RigidMotion(eqx.Module):
         lags_s: tuple[float, ...] = (0.17, 0.33, 0.67),
         noise_m: float = 0.004,
         noise_fraction: float = 0.08,
+        travel_per_m: float = 0.3,
         other_fraction: float = 0.8,
         most: float = 2.0,
         least: float = 4.0,
@@ -58,6 +62,7 @@ class RigidMotion(eqx.Module):
         self.lags_s = lags_s
         self.noise_m = Positive(noise_m)
         self.noise_fraction = Positive(noise_fraction)
+        self.travel_per_m = Positive(travel_per_m)
         self.other_fraction = Positive(other_fraction)
         self.most = Positive(most)
         self.least = Positive(least)
@@ -81,8 +86,10 @@ class RigidMotion(eqx.Module):
             rotation, shift_m = rigid_fit(own, before, centre_m, self.shrink_m2.value)
             residual_m2 = jnp.sum(jnp.square(centre_m - before @ rotation.T - shift_m[None]), axis=-1)
             moved_m = safe_norm(centre_m - before)
-            moved_m = jnp.maximum(moved_m, safe_divide(jnp.sum(own * moved_m), jnp.sum(own)))
+            body_m = safe_divide(jnp.sum(own * moved_m), jnp.sum(own))
+            moved_m = jnp.maximum(moved_m, body_m)
             inside = jnp.square(self.noise_m.value) + jnp.square(self.noise_fraction.value * moved_m)
+            inside = inside + jnp.square(self.travel_per_m.value * jnp.square(body_m))
             outside = inside + jnp.square(self.other_fraction.value * moved_m)
             ratio = 1.5 * jnp.log(outside / inside) - 0.5 * residual_m2 * (1.0 / inside - 1.0 / outside)
             return jnp.where(there, jnp.clip(ratio, lowest, highest), 0.0)

@@ -24,6 +24,7 @@ class SegmentFrame(eqx.Module):
     known: Bool[Array, " segment"]
     centre_m: Float[Array, "segment 3"]  # camera frame
     area: Float[Array, " segment"]  # pixels
+    size_m: Float[Array, " segment"]  # side of a square of this area at its depth
     life_s: Float[Array, " segment"]  # since birth
     displacement_m: Float[Array, "segment 3"]  # since birth
     moved: Bool[Array, " segment"]  # was ever displaced by `labels.moved_m`
@@ -86,6 +87,7 @@ class SegmentTracker(eqx.Module):
             known=motion.known,
             centre_m=kept.centre_m,
             area=jnp.where(seen, kept.area, 0.0),
+            size_m=jnp.sqrt(kept.area) * kept.centre_m[:, 2] / focal,
             life_s=kept.life_s,
             displacement_m=kept.displacement_m,
             moved=kept.moved,

@@ -37,14 +37,18 @@ from .outline import (
     segment_boxes,
     segment_centroids,
 )
-from .step import SegmentTracker, SegmentTrackerState
+from .place_memory import PlaceMemory, PlaceState
+from .step import SegmentFrame, SegmentTracker, SegmentTrackerState
+from .travel import TravellingTogether, TravelState
+from .whole import WholeBody
 
 
-class TagAttentionState(eqx.Module):
-    """What is carried from frame to frame."""
+class TagState(eqx.Module):
+    """What is carried from frame to frame of each tag, and of the motion that all share."""
 
     time_s: Float[Array, ""]  # of the last frame; NaN before the first
-    segments: SegmentTrackerState
+    travel: TravelState | None
+    place: PlaceState | None
     dwell: DwellState
     attention: AttentionState | None
     body: BodyState
@@ -52,15 +56,19 @@ class TagAttentionState(eqx.Module):
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
 
 
-class SegmentTrace(eqx.Module):
-    """The output for one frame, for every tag, on segments; `TagAttention.step` makes dense masks of it."""
+class TagAttentionState(eqx.Module):
+    """What is carried from frame to frame."""
 
-    labels: Int[Array, "height width"]  # slot of each pixel, -1 = none
+    segments: SegmentTrackerState
+    tags: TagState
+
+
+class Association(eqx.Module):
+    """Each tag's body among the segments of a frame."""
+
     membership: Float[Array, "tag segment"]  # probability that a segment belongs to the tag's body
-    box_px: Float[Array, "tag 4"]
-    centre_px: Float[Array, "tag 2"]
     centre_m: Float[Array, "tag 3"]
-    step_m: Float[Array, "tag antenna"]
+    step_m: Float[Array, "tag antenna"]  # change of the body's range since the last frame
     body_nats: Float[Array, " tag"]  # evidence of the reads that the tag moves with the body, against phases at random
     stationary_nats: Float[Array, " tag"]  # ... that it is stationary
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
@@ -68,25 +76,41 @@ class SegmentTrace(eqx.Module):
     detected: Bool[Array, " tag"]
 
 
+class SegmentTrace(eqx.Module):
+    """The output for one frame, for every tag, on segments; `TagAttention.step` makes dense masks of it."""
+
+    labels: Int[Array, "height width"]  # slot of each pixel, -1 = none
+    box_px: Float[Array, "tag 4"]
+    centre_px: Float[Array, "tag 2"]
+    tags: Association
+
+
 class TagAttention(AbstractTracer):
     """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values; None is a stage that is off."""
 
     segments: SegmentTracker = eqx.field(default_factory=SegmentTracker)
+    travel: TravellingTogether | None = eqx.field(default_factory=TravellingTogether)
+    place: PlaceMemory | None = None
     reader: ReaderModel = eqx.field(default_factory=ReaderModel)
     dwell: DwellEvidence = eqx.field(default_factory=DwellEvidence)
     attention: AttentionEvidence | None = None
     body: CarryingBody = eqx.field(default_factory=CarryingBody)
+    whole: WholeBody | None = eqx.field(default_factory=WholeBody)
     hidden: HiddenBody | None = eqx.field(default_factory=HiddenBody)
     detection: Detection = eqx.field(default_factory=Detection)
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         """The state before the first frame."""
+        return TagAttentionState(self.segments.init(camera), self._no_tags(camera, frame))
+
+    def _no_tags(self, camera: Camera, frame: Frame) -> TagState:
         assert frame.present is not None
         num_tags, num_antennas = frame.present.shape[-1], camera.antennas_m.shape[0]
         num_segments = self.segments.segmenter.num_segments
-        return TagAttentionState(
+        return TagState(
             time_s=jnp.asarray(jnp.nan, jnp.float32),
-            segments=self.segments.init(camera),
+            travel=None if self.travel is None else self.travel.init(num_segments),
+            place=None if self.place is None else self.place.init(num_tags),
             dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
             attention=self._no_attention(frame, num_segments),
             body=self.body.init(num_tags, num_segments),
@@ -94,20 +118,35 @@ class TagAttention(AbstractTracer):
             num_reads=jnp.zeros(num_tags),
         )
 
-    def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
-        """The next state and the output on segments, without dense masks."""
+    def _no_attention(self, frame: Frame, num_segments: int) -> AttentionState | None:
+        if self.attention is None:
+            return None
+        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
+        return AttentionState.nothing(num_tags, num_antennas, num_segments, num_window)
+
+    def associate(self, state: TagState, found: SegmentFrame, frame: Frame) -> tuple[TagState, Association]:
+        """The next state of the tags and their bodies, from a frame's segments and reads."""
         assert frame.arrivals is not None
         assert frame.present is not None
         now_s = frame.time_s
         since_s = jnp.where(jnp.isfinite(state.time_s), state.time_s, now_s)
-        segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, now_s - since_s)
+        dt_s = now_s - since_s
+        travel, pooling = state.travel, None
+        if self.travel is not None and travel is not None:
+            travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
         dwell, log_likelihood = self.dwell.step(
             self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
         )
-        hidden = state.hidden
+        hidden, place = state.hidden, state.place
         if self.hidden is not None and hidden is not None:
             log_likelihood = self.hidden.inherited(hidden, log_likelihood, found.centre_m, found.source > -2)
-            dwell = eqx.tree_at(lambda d: d.log_likelihood, dwell, log_likelihood)
+        if self.place is not None and place is not None:
+            place, log_likelihood = self.place.lend(
+                place, log_likelihood, found.centre_m, found.area, found.life_s, dt_s
+            )
+        if self.travel is not None and pooling is not None:
+            log_likelihood = self.travel.heal(pooling, log_likelihood, dt_s)
+        dwell = eqx.tree_at(lambda d: d.log_likelihood, dwell, log_likelihood)
         attention = state.attention
         if self.attention is not None and attention is not None:
             attention, agreed = self.attention.step(
@@ -119,7 +158,16 @@ class TagAttention(AbstractTracer):
             state.body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
             since_s, now_s,
         )  # fmt: skip
-        membership = jnp.where(frame.present[:, None], jax.nn.sigmoid(bodies.log_odds), 0.0)
+        if self.place is not None and place is not None:
+            moved, el = body.past.since(0.33, found.displacement_m, found.life_s, now_s)
+            place = self.place.update(
+                place, bodies.log_odds, evidence, found.centre_m, moved / jnp.maximum(el, 0.1)[:, None], found.area
+            )
+        membership = jax.nn.sigmoid(bodies.log_odds)
+        if self.whole is not None:
+            moved = body.past.since(self.whole.lag_s, found.displacement_m, found.life_s, now_s)
+            membership = self.whole.completed(membership, found, *moved)
+        membership = jnp.where(frame.present[:, None], membership, 0.0)
         weight = membership * found.area[None]
         total = jnp.sum(weight, axis=1)
 
@@ -130,22 +178,15 @@ class TagAttention(AbstractTracer):
         body_nats = jnp.where(total > 0, body_nats, -1e4)
         hides = jnp.zeros(total.shape, bool)
         if self.hidden is not None and hidden is not None:
-            dt_s = now_s - since_s
             velocity = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
             kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
             hidden, hides = self.hidden.step(hidden, body_nats, mean(found.centre_m), velocity, kept, dt_s)
         num_reads = self.detection.received(state.num_reads, frame.arrivals, since_s, now_s)
         confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
-        labels = filled_labels(found.labels, frame.depth_m)
-        num_segments = found.area.shape[0]
-        member = membership > 0.5
-        box_px = joined_boxes(segment_boxes(labels, num_segments), member)
-        confidence = jnp.where(frame.present & jnp.any(member, axis=1) & ~hides, confidence, 0.0)
-        out = SegmentTrace(
-            labels=labels,
+        in_view = jnp.any(membership > 0.5, axis=1)
+        confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
+        out = Association(
             membership=membership,
-            box_px=box_px,
-            centre_px=joined_centroids(segment_centroids(labels, num_segments), member),
             centre_m=mean(found.centre_m),
             step_m=mean(found.increment_m.T),
             body_nats=body_nats,
@@ -154,25 +195,35 @@ class TagAttention(AbstractTracer):
             confidence=confidence,
             detected=self.detection.detected(confidence),
         )
-        return TagAttentionState(now_s, segments, dwell, attention, body, hidden, num_reads), out
+        return TagState(now_s, travel, place, dwell, attention, body, hidden, num_reads), out
 
-    def _no_attention(self, frame: Frame, num_segments: int) -> AttentionState | None:
-        if self.attention is None:
-            return None
-        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
-        return AttentionState.nothing(num_tags, num_antennas, num_segments, num_window)
+    def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
+        """The next state and the output on segments, without dense masks."""
+        last_s = state.tags.time_s
+        dt_s = jnp.where(jnp.isfinite(last_s), frame.time_s - last_s, 0.0)
+        segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, dt_s)
+        tags, out = self.associate(state.tags, found, frame)
+        labels = filled_labels(found.labels, frame.depth_m)
+        num_segments, member = found.area.shape[0], out.membership > 0.5
+        return TagAttentionState(segments, tags), SegmentTrace(
+            labels=labels,
+            box_px=joined_boxes(segment_boxes(labels, num_segments), member),
+            centre_px=joined_centroids(segment_centroids(labels, num_segments), member),
+            tags=out,
+        )
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
         """The next state, and the `Trace` of this frame with dense masks."""
         state, out = self.follow(camera, state, frame)
+        tags = out.tags
         return state, Trace(
-            mask=dense_masks(out.labels, out.membership),
+            mask=dense_masks(out.labels, tags.membership),
             box_px=out.box_px,
             centre_px=out.centre_px,
-            centre_m=out.centre_m,
-            step_m=out.step_m,
-            confidence=out.confidence,
-            detected=out.detected,
+            centre_m=tags.centre_m,
+            step_m=tags.step_m,
+            confidence=tags.confidence,
+            detected=tags.detected,
         )
 
     def finish(self, state: Any) -> Any:

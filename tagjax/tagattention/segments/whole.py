@@ -1,0 +1,98 @@
+"""What walks is one body: all that is connected with the tag's body and travels is part of it.
+
+The parts of a walking person move against each other, so that no rigid motion holds them together. But all of them get
+on, while the arm of someone who stays in place goes to and fro: over two thirds of a second its net displacement is small.
+So where most of a tag's body travels, the segments that travel too, and are connected with it by segments that travel,
+belong to it. Two segments are connected where their middles are not further apart than `gap` times their mean size.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...core.constrained import Fraction, Positive
+from ...core.numerics import safe_divide, safe_norm
+from .step import SegmentFrame
+
+_ROUNDS = 6
+_MOST = 0.95  # probability that a connected segment belongs to the body
+
+
+class WholeBody(eqx.Module):
+    """Stage that completes bodies that travel. `WholeBody()` has good values."""
+
+    travel_m_s: Positive  # net displacement over `lag_s`, above which a segment travels
+    gap: Positive
+    share: Fraction  # a body travels where so much of it does
+    lag_s: float = eqx.field(static=True)
+    num_active: int = eqx.field(static=True)  # segments that are looked at: those that travel fastest
+
+    def __init__(
+        self,
+        *,
+        travel_m_s: float = 0.2,
+        gap: float = 3.0,
+        share: float = 0.5,
+        lag_s: float = 0.67,
+        num_active: int = 256,
+    ) -> None:
+        """Raises `ValueError` for a value that is not positive, or a share that is not between 0 and 1."""
+        if not lag_s > 0:
+            raise ValueError(f"lag_s is {lag_s}; expected a positive time.")
+        if num_active < 1:
+            raise ValueError(f"num_active is {num_active}; expected at least 1.")
+        self.travel_m_s, self.gap, self.share = Positive(travel_m_s), Positive(gap), Fraction(share)
+        self.lag_s, self.num_active = float(lag_s), num_active
+
+    def completed(
+        self,
+        membership: Float[Array, "tag segment"],
+        found: SegmentFrame,
+        moved_m: Float[Array, "segment 3"],
+        elapsed_s: Float[Array, " segment"],
+    ) -> Float[Array, "tag segment"]:
+        """The membership (probabilities) with all of each body that travels.
+
+        `moved_m` is each segment's displacement over `lag_s`, or since its birth `elapsed_s` ago where that is shorter.
+        """
+        num_segments = found.area.shape[0]
+        exists = (found.area > 0) & (jnp.arange(num_segments) > 0)
+        speed_m_s = jnp.where(exists, safe_norm(moved_m) / jnp.maximum(elapsed_s, 0.5 * self.lag_s), 0.0)
+        _, at = jax.lax.top_k(jax.lax.stop_gradient(speed_m_s), min(self.num_active, num_segments))
+        limit_m_s = self.travel_m_s.value
+        travels = jnp.where(exists[at], jax.nn.sigmoid((speed_m_s[at] - limit_m_s) / (0.2 * limit_m_s)), 0.0)
+        body = connected(found.centre_m[at], self.gap.value * found.size_m[at], travels > 0.5)
+
+        def of_tag(own: Float[Array, " segment"]) -> Float[Array, " segment"]:
+            weight = own * found.area
+            going = weight[at] * travels
+            share = safe_divide(jnp.sum(going), jnp.sum(weight))
+            goes = jax.nn.sigmoid((share - self.share.value) / 0.1)
+            of_body = jax.ops.segment_sum(going, body, at.shape[0])
+            same = body == jnp.argmax(of_body)
+            more = jnp.where(same, _MOST * goes * travels, 0.0)
+            return own.at[at].set(1.0 - (1.0 - own[at]) * (1.0 - more))
+
+        return jax.vmap(of_tag)(membership)
+
+
+def connected(
+    centre_m: Float[Array, "segment 3"], reach_m: Float[Array, " segment"], member: Bool[Array, " segment"]
+) -> Int[Array, " segment"]:
+    """The largest index of a segment in each one's connected component; a segment that is no member is one by itself.
+
+    Members are connected where their centres are closer than the mean of their reaches. Components whose diameter
+    exceeds what six rounds of propagation reach (some 100 segments in a chain) may be split.
+    """
+    apart_m2 = sum(jnp.square(own[:, None] - own[None]) for own in centre_m.T)
+    close = apart_m2 < jnp.square(0.5 * (reach_m[:, None] + reach_m[None]))
+    close = (close & member[:, None] & member[None]) | jnp.eye(len(centre_m), dtype=bool)
+    index = jnp.arange(len(centre_m), dtype=jnp.int32)
+    for _ in range(_ROUNDS):
+        index = jnp.max(jnp.where(close, index[None], -1), axis=1)
+        index = index[index]
+        index = index[index]
+    return index

@@ -1,0 +1,179 @@
+"""Motion pooled over what travels together, and the memory of a tag's place: closed forms, gradients, compiled or not."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tagjax.tagattention.segments import CarryingBody, PlaceMemory, TravellingTogether
+
+NUM = 24
+AREA = jnp.full(NUM, 16.0).at[0].set(500.0)
+GOES_ON = jnp.full(NUM, -2, jnp.int32)
+
+
+def walker(num_frames: int = 20, *, noise_m: float = 0.0, rate_hz: float = 10.0, apart: bool = False):
+    """A trunk (1 to 12) that travels 1.2 m/s, a leg (13 to 18) that swings by 10 cm about it, and a shape at rest beside.
+
+    Where `apart`, the leg stays behind instead, as an arm does. Yields centre, motion and time.
+    """
+    rng = np.random.default_rng(0)
+    start = np.zeros((NUM, 3)) + np.array([0.0, 0.0, 4.0])
+    start[1:13] += rng.uniform([-0.15, -0.3, 0.0], [0.15, 0.3, 0.1], (12, 3))
+    start[13:19] += np.stack([np.zeros(6), np.linspace(0.35, 0.7, 6), np.zeros(6)], axis=-1)
+    start[19:] += rng.uniform([0.9, -0.3, 0.0], [1.2, 0.3, 0.1], (5, 3))
+    last = start
+    for frame in range(num_frames):
+        time_s, at = frame / rate_hz, start.copy()
+        at[1:13, 0] += 1.2 * time_s
+        at[13:19, 0] += 0.2 * time_s if apart else 1.2 * time_s + 0.1 * np.sin(2 * np.pi * time_s)
+        error = rng.normal(0, noise_m, (NUM, 3)) if frame else np.zeros((NUM, 3))
+        yield (
+            jnp.asarray(at, jnp.float32),
+            jnp.asarray(at - last + error, jnp.float32),
+            jnp.asarray(time_s, jnp.float32),
+        )
+        last = at
+
+
+def travelled(stage: TravellingTogether, frames):
+    """The pooled motion of each frame."""
+    state, last_s = stage.init(NUM), jnp.asarray(-0.1)
+    step = eqx.filter_jit(stage.step)
+    for centre, motion, now_s in frames:
+        state, travel = step(state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, GOES_ON, last_s, now_s)
+        last_s = now_s
+        yield travel
+
+
+def test_pooling_averages_errors_away_and_leaves_what_travels_otherwise():
+    noisy = list(walker(noise_m=0.02))
+    errors, plain = [], []
+    for (_, motion, _), travel, (_, true, _) in zip(
+        noisy, travelled(TravellingTogether(), noisy), walker(), strict=True
+    ):
+        errors.append(travel.increment_m[0, 1:13] - true[1:13, 0])
+        plain.append(motion[1:13, 0] - true[1:13, 0])
+    assert np.std(errors[8:]) < 0.5 * np.std(plain[8:])
+    *_, travel = travelled(TravellingTogether(), walker(apart=True))
+    np.testing.assert_allclose(travel.increment_m[0, 1:13], 0.12, atol=2e-3)
+    np.testing.assert_allclose(travel.increment_m[0, 13:19], 0.02, atol=2e-3)
+    np.testing.assert_allclose(jnp.sum(travel.weight, axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_a_swinging_leg_belongs_to_the_walker_and_what_stays_behind_does_not(apart):
+    evidence = jnp.zeros((1, NUM)).at[0, 1:13].set(60.0).at[0, 13:19].set(40.0)
+    body, last_s = CarryingBody(), jnp.asarray(-0.1)
+    state, bodies = body.init(1, NUM), None
+    step = eqx.filter_jit(body.step)
+    frames = list(walker(apart=apart))
+    for (centre, _, now_s), travel in zip(frames, travelled(TravellingTogether(), frames), strict=True):
+        state, bodies = step(
+            state, evidence, centre, AREA, travel.life_s, travel.displacement_m, travel.source, last_s, now_s
+        )
+        last_s = now_s
+    member = np.asarray(bodies.log_odds)[0] > 0
+    assert member[1:13].all()
+    assert not member[19:].any()
+    assert member[13:19].all() if not apart else not member[13:19].any()
+
+
+def test_a_new_segment_goes_on_from_its_source_or_the_nearest_mover():
+    stage = TravellingTogether()
+    state, last_s = stage.init(NUM), jnp.asarray(-0.1)
+    frames = list(walker())
+    for centre, motion, now_s in frames[:-1]:
+        state, travel = stage.step(
+            state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, GOES_ON, last_s, now_s
+        )
+        last_s = now_s
+    centre, motion, now_s = frames[-1]
+    source = GOES_ON.at[5].set(3).at[13].set(-1).at[20].set(-1)
+    _, travel = stage.step(state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, source, last_s, now_s)
+    np.testing.assert_allclose(travel.displacement_m[5], state.displacement_m[3], atol=1e-6)
+    assert int(travel.source[13]) in range(1, 19)
+    assert float(travel.displacement_m[13, 0]) > 1.5
+    assert int(travel.source[20]) == -1
+    assert float(travel.life_s[20]) == pytest.approx(0.1, abs=1e-3)
+    assert int(travel.source[5]) == 3
+    assert int(travel.source[0]) == -2
+
+
+def test_evidence_heals_towards_that_of_what_travels_together():
+    stage = TravellingTogether()
+    *_, travel = travelled(stage, walker())
+    log_likelihood = jnp.full((1, NUM), 0.0).at[0, 1:19].set(50.0).at[0, 4].set(0.0)
+    healed = stage.heal(travel, log_likelihood, jnp.asarray(1.0))
+    assert 30.0 < float(healed[0, 4]) < 50.0
+    assert float(healed[0, 20]) < 1e-3
+    np.testing.assert_allclose(stage.heal(travel, log_likelihood, jnp.asarray(0.0)), log_likelihood, atol=1e-4)
+
+
+def test_a_hidden_body_lends_its_evidence_to_what_appears_where_it_must_be():
+    memory = PlaceMemory(reach=1.0, drift=0.5, loss_nats=10.0, young_s=0.5, memory_s=4.0, coast_s=2.0)
+    centre = jnp.zeros((NUM, 3)).at[:, 2].set(4.0).at[1:5, 1].set(jnp.array([-0.3, -0.1, 0.1, 0.3])).at[9, 0].set(3.0)
+    odds = jnp.full((1, NUM), -30.0).at[0, 1:5].set(30.0)
+    velocity = jnp.zeros((NUM, 3)).at[:, 0].set(1.0)
+    state = memory.update(memory.init(1), odds, jnp.full((1, NUM), 80.0), centre, velocity, AREA)
+    assert float(state.extent_m[0]) == pytest.approx(np.sqrt(0.05), rel=1e-3)
+    old, none = jnp.full(NUM, 9.0), jnp.zeros((1, NUM))
+    state, kept = memory.lend(state, none, centre, AREA, old, jnp.asarray(0.5))
+    np.testing.assert_array_equal(kept, none)
+    place_m = float(state.place_m[0, 0])
+    assert place_m == pytest.approx(0.5)
+    moved = centre.at[6, 0].set(place_m).at[7, 0].set(place_m + 0.2)
+    _, lent = memory.lend(state, none, moved, AREA, old.at[6:10].set(0.0), jnp.asarray(0.0))
+    kept_nats = 80.0 * np.exp(-0.5 / 4.0)
+    scale = 0.02 + np.sqrt(0.05) * (1.0 + 0.5 * 0.5)
+    assert float(lent[0, 6]) == pytest.approx(kept_nats, rel=1e-4)
+    assert float(lent[0, 7]) == pytest.approx(kept_nats - 10.0 * (0.2 / scale) ** 2, rel=1e-4)
+    assert float(lent[0, 9]) == 0.0
+    assert float(lent[0, 1]) == 0.0
+
+
+def test_another_body_with_less_evidence_does_not_replace_the_remembered_one():
+    memory = PlaceMemory(same=0.9)
+    centre, still = jnp.zeros((NUM, 3)).at[5:9, 0].set(2.0), jnp.zeros((NUM, 3))
+    first = jnp.full((1, NUM), -30.0).at[0, 1:5].set(30.0)
+    other = jnp.full((1, NUM), -30.0).at[0, 5:9].set(30.0)
+    state = memory.update(memory.init(1), first, jnp.full((1, NUM), 80.0), centre, still, AREA)
+    kept = memory.update(state, other, jnp.full((1, NUM), 60.0), centre, still, AREA)
+    taken = memory.update(state, other, jnp.full((1, NUM), 90.0), centre, still, AREA)
+    assert float(kept.place_m[0, 0]) == pytest.approx(0.0)
+    assert float(taken.place_m[0, 0]) == pytest.approx(2.0)
+
+
+def test_gradients_are_finite_and_compiled_is_eager():
+    stage, memory = TravellingTogether(), PlaceMemory()
+    frames = list(walker(6))
+
+    def total(stage, memory, scale):
+        state, place, last_s, value = stage.init(NUM), memory.init(1), jnp.asarray(-0.1), 0.0
+        for centre, motion, now_s in frames:
+            motion = scale * motion
+            state, travel = stage.step(
+                state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, GOES_ON, last_s, now_s
+            )
+            evidence = jnp.cumsum(jnp.abs(travel.increment_m), axis=1) * 100.0
+            place, evidence = memory.lend(place, evidence, centre, AREA, travel.life_s, now_s - last_s)
+            evidence = stage.heal(travel, evidence, now_s - last_s)
+            place = memory.update(place, evidence - 5.0, evidence, centre, motion, AREA)
+            value, last_s = value + jnp.sum(jnp.sin(evidence)) + jnp.sum(travel.displacement_m), now_s
+        return value
+
+    one = jnp.ones(())
+    gradients = (*eqx.filter_grad(total)(stage, memory, one).__dict__.values(), jax.grad(total, 2)(stage, memory, one))
+    leaves = jax.tree.leaves(eqx.filter(gradients, eqx.is_inexact_array))
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
+    assert float(jnp.abs(leaves[-1])) > 0
+    np.testing.assert_allclose(eqx.filter_jit(total)(stage, memory, one), total(stage, memory, one), rtol=1e-3)
+
+
+@pytest.mark.parametrize("arguments", [{"num_active": 0}, {"num_newborn": 0}, {"lag_s": 0.0}, {"reach_m": -1.0}])
+def test_wrong_travel_settings_are_refused(arguments):
+    with pytest.raises(ValueError, match="expected"):
+        TravellingTogether(**arguments)
