@@ -25,6 +25,7 @@ from ...radio.reader_model import ReaderModel
 from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody
+from .cut import cut_segments
 from .detection import Detection
 from .dwell import DwellEvidence, DwellState
 from .hidden import HiddenBody, HiddenState
@@ -45,9 +46,9 @@ class TagAttentionState(eqx.Module):
 
     time_s: Float[Array, ""]  # of the last frame; NaN before the first
     segments: SegmentTrackerState
-    dwell: DwellState
+    dwell: DwellState | None
     attention: AttentionState | None
-    body: BodyState
+    body: BodyState | None
     hidden: HiddenState | None
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
 
@@ -69,27 +70,44 @@ class SegmentTrace(eqx.Module):
 
 
 class TagAttention(AbstractTracer):
-    """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values; None is a stage that is off."""
+    """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values.
+
+    None is a stage that is off. Without `body` the segments that explain the reads best are the object (`cut_segments`).
+    Raises `ValueError` without any evidence, and for `hidden`, which remembers dwells, without them.
+    """
 
     segments: SegmentTracker = eqx.field(default_factory=SegmentTracker)
     reader: ReaderModel = eqx.field(default_factory=ReaderModel)
-    dwell: DwellEvidence = eqx.field(default_factory=DwellEvidence)
+    dwell: DwellEvidence | None = eqx.field(default_factory=DwellEvidence)
     attention: AttentionEvidence | None = None
-    body: CarryingBody = eqx.field(default_factory=CarryingBody)
+    body: CarryingBody | None = eqx.field(default_factory=CarryingBody)
     hidden: HiddenBody | None = eqx.field(default_factory=HiddenBody)
     detection: Detection = eqx.field(default_factory=Detection)
+
+    def __check_init__(self) -> None:
+        if self.dwell is None and self.attention is None:
+            raise ValueError("dwell and attention are both off; expected at least one: nothing else uses the reads.")
+        if self.hidden is not None and self.dwell is None:
+            raise ValueError("hidden is on and dwell is off; expected dwell for it. Set hidden to null.")
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         """The state before the first frame."""
         assert frame.present is not None
-        num_tags, num_antennas = frame.present.shape[-1], camera.antennas_m.shape[0]
-        num_segments = self.segments.segmenter.num_segments
+        return self._nothing(camera, frame.present.shape[-1], frame.radio.relative_m.shape[-1], frame.time_s)
+
+    def _nothing(self, camera: Camera, num_tags: int, num_window: int, time_s: Float[Array, ""]) -> TagAttentionState:
+        num_antennas, num_segments = camera.antennas_m.shape[0], self.segments.segmenter.num_segments
+        dwell = attention = None
+        if self.dwell is not None:
+            dwell = DwellState.nothing(num_tags, num_antennas, num_segments)
+        if self.attention is not None:
+            attention = AttentionState.nothing(num_tags, num_antennas, num_segments, num_window, time_s)
         return TagAttentionState(
             time_s=jnp.asarray(jnp.nan, jnp.float32),
             segments=self.segments.init(camera),
-            dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
-            attention=self._no_attention(frame, num_segments),
-            body=self.body.init(num_tags, num_segments),
+            dwell=dwell,
+            attention=attention,
+            body=None if self.body is None else self.body.init(num_tags, num_segments),
             hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
             num_reads=jnp.zeros(num_tags),
         )
@@ -101,11 +119,13 @@ class TagAttention(AbstractTracer):
         now_s = frame.time_s
         since_s = jnp.where(jnp.isfinite(state.time_s), state.time_s, now_s)
         segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, now_s - since_s)
-        dwell, log_likelihood = self.dwell.step(
-            self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
-        )
+        dwell, log_likelihood = state.dwell, jnp.zeros((frame.present.shape[0], found.area.shape[0]))
+        if self.dwell is not None and dwell is not None:
+            dwell, log_likelihood = self.dwell.step(
+                self.reader, dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
+            )
         hidden = state.hidden
-        if self.hidden is not None and hidden is not None:
+        if self.hidden is not None and hidden is not None and dwell is not None:
             log_likelihood = self.hidden.inherited(hidden, log_likelihood, found.centre_m, found.source > -2)
             dwell = eqx.tree_at(lambda d: d.log_likelihood, dwell, log_likelihood)
         attention = state.attention
@@ -114,12 +134,18 @@ class TagAttention(AbstractTracer):
                 attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
             )
             log_likelihood = log_likelihood + self.attention.weight.value * agreed
-        evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
-        body, bodies = self.body.step(
-            state.body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
-            since_s, now_s,
-        )  # fmt: skip
-        membership = jnp.where(frame.present[:, None], jax.nn.sigmoid(bodies.log_odds), 0.0)
+        body = state.body
+        if self.body is not None and body is not None:
+            evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
+            body, bodies = self.body.step(
+                body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
+                since_s, now_s,
+            )  # fmt: skip
+            membership = jax.nn.sigmoid(bodies.log_odds)
+        else:
+            moving = (found.area > 0) & (jnp.arange(found.area.shape[0]) != STATIC)
+            membership = cut_segments(log_likelihood, moving)
+        membership = jnp.where(frame.present[:, None], membership, 0.0)
         weight = membership * found.area[None]
         total = jnp.sum(weight, axis=1)
 
@@ -129,7 +155,7 @@ class TagAttention(AbstractTracer):
         body_nats = safe_divide(jnp.sum(weight * log_likelihood, axis=1), total)
         body_nats = jnp.where(total > 0, body_nats, -1e4)
         hides = jnp.zeros(total.shape, bool)
-        if self.hidden is not None and hidden is not None:
+        if self.hidden is not None and hidden is not None and self.dwell is not None:
             dt_s = now_s - since_s
             velocity = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
             kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
@@ -156,12 +182,6 @@ class TagAttention(AbstractTracer):
         )
         return TagAttentionState(now_s, segments, dwell, attention, body, hidden, num_reads), out
 
-    def _no_attention(self, frame: Frame, num_segments: int) -> AttentionState | None:
-        if self.attention is None:
-            return None
-        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
-        return AttentionState.nothing(num_tags, num_antennas, num_segments, num_window)
-
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
         """The next state, and the `Trace` of this frame with dense masks."""
         state, out = self.follow(camera, state, frame)
@@ -181,34 +201,32 @@ class TagAttention(AbstractTracer):
 
     def with_tags(self, camera: Camera, state: TagAttentionState, source: Int[Array, " tag"]) -> TagAttentionState:
         """The state for other tags: `source` is each one's place among the present ones, -1 for a new tag."""
-        num_tags, num_segments = source.shape[0], self.segments.segmenter.num_segments
-        fresh = (
-            DwellState.nothing(num_tags, camera.antennas_m.shape[0], num_segments),
-            jnp.zeros((num_tags, num_segments)),
-            jnp.zeros(num_tags),
-        )
+        num_window = 1 if state.attention is None else state.attention.time_s.shape[0]
+        fresh = self._nothing(camera, source.shape[0], num_window, state.time_s)
+
+        def per_tag(one: TagAttentionState) -> list[Any]:
+            """All leaves whose first axis is that of the tags."""
+            found = [one.num_reads, *jax.tree.leaves(one.hidden)]
+            if one.dwell is not None:
+                dwell = one.dwell
+                found += [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
+            found += [one.attention.log_likelihood] if one.attention is not None else []
+            return found + ([one.body.membership] if one.body is not None else [])
 
         def moved(new: Array, old: Array) -> Array:
             known = (source >= 0).reshape(-1, *[1] * (new.ndim - 1))
             return jnp.where(known, old[jnp.maximum(source, 0)], new)
 
-        def per_tag(one: TagAttentionState) -> list[Any]:
-            dwell = one.dwell
-            found = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
-            found += [one.body.membership, one.num_reads]
-            return found + ([one.attention.log_likelihood] if one.attention is not None else [])
-
-        dwell, table, row = fresh
-        new = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood, table, row, table]
-        old = per_tag(state)
-        return eqx.tree_at(per_tag, state, [moved(one, other) for one, other in zip(new, old, strict=False)])
+        leaves = [moved(new, old) for new, old in zip(per_tag(fresh), per_tag(state), strict=True)]
+        return eqx.tree_at(per_tag, state, leaves)
 
     def shifted(self, state: TagAttentionState, by_s: Float[Array, ""]) -> TagAttentionState:
         """The state with all times later by `by_s`: for another origin of time."""
 
         def times(one: TagAttentionState) -> list[Any]:
-            found = [one.time_s, one.body.past.time_s]
-            return found + ([one.attention.time_s] if one.attention is not None else [])
+            found = [one.time_s]
+            found += [one.attention.time_s] if one.attention is not None else []
+            return found + ([one.body.past.time_s] if one.body is not None else [])
 
         return eqx.tree_at(times, state, [one + by_s for one in times(state)])
 
