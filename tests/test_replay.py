@@ -92,7 +92,6 @@ def _config(folder: Path, **changed) -> StreamConfig:
         recording=str(folder / "scene.zarr"),
         tracer=settings,
         flow="zero",
-        stride=1,
         num_places=2,
         replay=FAST,
         **changed,
@@ -108,6 +107,8 @@ def test_a_stream_writes_a_line_a_frame_and_a_summary(tmp_path):
     assert not summary["interrupted"]
     assert json.loads((tmp_path / "run/stream.json").read_text())["frames"] == 24
     assert set(lines[-1]["tags"]) == {"tag-a", "tag-b"}
+    x0, _, x1, _ = lines[-1]["tags"]["tag-a"]["box_px"]  # every pixel of a picture 64 pixels wide
+    np.testing.assert_allclose([x0, x1], [8, 23], atol=1.0)
     tag = lines[-1]["tags"]["tag-a"]
     assert tag["detected"]
     assert tag["confidence"] > 0.5

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..core.camera import working_stride
 from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..flow.registry import make_flow
@@ -35,7 +36,7 @@ class StreamConfig:
     tracer: Mapping[str, Any]
     weights: str | None = None
     flow: str = "dis"
-    stride: int | None = None  # None: that of the tracer's settings
+    stride: int | None = None  # None: that of the tracer's settings, or else of the picture's width
     num_places: int = 4  # for tags, before more are made
     replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)
 
@@ -77,7 +78,8 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
             f"tracer: found {config.tracer.get('_target_')}; expected one that runs live, as TagAttention does."
         )
     recording = open_recording(config.recording)
-    stride = config.stride or tracer_clips(config.tracer).stride
+    own = tracer_clips(config.tracer).stride if config.stride is None else config.stride
+    stride = working_stride(recording.intrinsics.width, own)
     live = LiveTracer(
         tracer,
         recording.intrinsics,

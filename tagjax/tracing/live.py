@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from ..core.camera import Intrinsics
+from ..core.camera import Intrinsics, working_stride
 from ..core.geometry import pixel_rays, range_to_depth
 from ..radio.arrivals import Arrivals
 from ..radio.reads import PhaseReads, RadioWindow
@@ -59,7 +59,7 @@ class LiveFrame:
 class LiveTracer:
     """Holds a tracer's state between frames. `process` takes the next frame; frames come in order of time.
 
-    `flow` gives the flow from the first picture to the second, (height, width, 2) pixels; `stride` keeps every n-th pixel;
+    `flow` gives the flow from the first picture to the second, (height, width, 2) pixels; `stride` keeps every n-th pixel, None about 256 columns;
     `antennas` are the numbers (from 1) of those at `antennas_m`, of which reads are used. A tag that has not been read for
     `forget_s` gives its place to a new one; there are `num_places` from the start. Raises `ValueError` for a stride below 1,
     and for a number of places that is not 1, 2, 4, ..., 64.
@@ -72,15 +72,14 @@ class LiveTracer:
         antennas_m: np.ndarray,
         *,
         flow: Callable[[np.ndarray, np.ndarray], np.ndarray],
-        stride: int = 2,
+        stride: int | None = None,
         antennas: tuple[int, ...] = (1,),
         depth_kind: str = "depth",
         num_reads: int = MAX_ARRIVALS,
         num_places: int = 1,
         forget_s: float = 30.0,
     ):
-        if stride < 1:
-            raise ValueError(f"stride is {stride}; expected at least 1 (every n-th pixel is kept).")
+        stride = working_stride(intrinsics.width, stride)
         if num_places not in _NUM_PLACES:
             raise ValueError(f"num_places is {num_places}; expected one of {', '.join(map(str, _NUM_PLACES))}.")
         self._tracer, self._intrinsics, self._flow, self._stride = tracer, intrinsics, flow, stride
@@ -194,7 +193,7 @@ class LiveTracer:
 
 
 def _no_reads(num_tags: int, num_antennas: int) -> PhaseReads:
-    zero = np.zeros((num_tags, num_antennas, 1), np.float32)
+    zero: Any = np.zeros((num_tags, num_antennas, 1), np.float32)
     return PhaseReads(zero, zero, zero, zero, zero.astype(np.int32), zero > 0)
 
 
