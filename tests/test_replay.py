@@ -104,6 +104,8 @@ def test_a_stream_writes_a_line_a_frame_and_a_summary(tmp_path):
     lines = [json.loads(line) for line in (tmp_path / "run/frames.jsonl").read_text().splitlines()]
     assert len(lines) == len(seen) == summary["frames"] == 24
     assert summary["dropped_frames"] == 0
+    assert summary["unused_reads"] == 1  # at the time of the first frame, which has none
+    assert summary["camera_moved"] is False
     assert not summary["interrupted"]
     assert json.loads((tmp_path / "run/stream.json").read_text())["frames"] == 24
     assert set(lines[-1]["tags"]) == {"tag-a", "tag-b"}

@@ -91,7 +91,7 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
         num_places=config.num_places,
     )
     start_s = live.warm_up()
-    computing, latency, num_frames, num_dropped_reads = Milliseconds(), Milliseconds(), 0, 0
+    computing, latency, num_frames, num_dropped_reads, num_unused_reads = Milliseconds(), Milliseconds(), 0, 0, 0
     begun, interrupted = time.monotonic(), False
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "frames.jsonl").open("w") as lines, contextlib.closing(Replay(recording, config.replay)) as replay:
@@ -105,6 +105,7 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
                 latency.add(done - frame.due_s)
                 num_frames += 1
                 num_dropped_reads += found.num_dropped
+                num_unused_reads += found.num_unused
                 line = _line(found, stride, recording.image_shape)
                 lines.write(json.dumps(line) + "\n")
                 if on_frame is not None:
@@ -116,6 +117,8 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
             "frames": num_frames,
             "dropped_frames": replay.num_dropped,
             "dropped_reads": num_dropped_reads,
+            "unused_reads": num_unused_reads,
+            "camera_moved": live.camera_moved,
             "frames_per_s": round(num_frames / max(time.monotonic() - begun, 1e-9), 2),
             "start_s": round(start_s, 2),
             "process_ms": computing.summary(),

@@ -40,6 +40,9 @@ from .outline import (
 )
 from .step import SegmentTracker, SegmentTrackerState
 
+CAMERA_MOVED_FRACTION = 0.8
+"""Of the static background that shows another depth, in two frames: the camera moved. People in front of it cover less."""
+
 
 class TagAttentionState(eqx.Module):
     """What is carried from frame to frame."""
@@ -51,6 +54,8 @@ class TagAttentionState(eqx.Module):
     body: BodyState | None
     hidden: HiddenState | None
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
+    background_lost: Float[Array, ""]  # of the last frame, as in `SegmentFrame`
+    camera_moved: Bool[Array, ""]  # so far
 
 
 class SegmentTrace(eqx.Module):
@@ -110,6 +115,8 @@ class TagAttention(AbstractTracer):
             body=None if self.body is None else self.body.init(num_tags, num_segments),
             hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
             num_reads=jnp.zeros(num_tags),
+            background_lost=jnp.zeros(()),
+            camera_moved=jnp.zeros((), bool),
         )
 
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
@@ -117,7 +124,8 @@ class TagAttention(AbstractTracer):
         assert frame.arrivals is not None
         assert frame.present is not None
         now_s = frame.time_s
-        since_s = jnp.where(jnp.isfinite(state.time_s), state.time_s, now_s)
+        # A time that goes back counts as that of the last frame.
+        since_s = jnp.where(jnp.isfinite(state.time_s), jnp.minimum(state.time_s, now_s), now_s)
         segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, now_s - since_s)
         dwell, log_likelihood = state.dwell, jnp.zeros((frame.present.shape[0], found.area.shape[0]))
         if self.dwell is not None and dwell is not None:
@@ -180,7 +188,12 @@ class TagAttention(AbstractTracer):
             confidence=confidence,
             detected=self.detection.detected(confidence),
         )
-        return TagAttentionState(now_s, segments, dwell, attention, body, hidden, num_reads), out
+        # A single frame's wrong depth is no motion; a deeper surface is accepted as background within two or three.
+        lost = jnp.minimum(state.background_lost, found.background_lost) > CAMERA_MOVED_FRACTION
+        after = TagAttentionState(
+            now_s, segments, dwell, attention, body, hidden, num_reads, found.background_lost, state.camera_moved | lost
+        )
+        return after, out
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
         """The next state, and the `Trace` of this frame with dense masks."""
@@ -194,6 +207,10 @@ class TagAttention(AbstractTracer):
             confidence=out.confidence,
             detected=out.detected,
         )
+
+    def camera_moved(self, state: TagAttentionState) -> Bool[Array, ""]:
+        """Whether in two frames one after the other nearly all of the static background showed another depth."""
+        return state.camera_moved
 
     def finish(self, state: Any) -> Any:
         """The state itself: it holds no buffer of a frame."""
