@@ -610,14 +610,16 @@ def test_refined_paths_keep_the_tilt_of_phase_by_what_was_moved_before(table):
     assert _rms_mm(errors) < 1.0
 
 
-def test_the_slope_of_channels_is_that_at_the_first_distance():
+def test_the_slope_of_channels_is_that_at_the_first_or_at_the_mean_distance():
     """While the tag moves away by 2 m, which adds 0.08 rad/MHz."""
     reads = simulate_reads(
         np.random.default_rng(1), lambda t: 1.5 + 0.3 * t, 6.7, reflector=0.0, sigma_rad=0.02, flip_share=0.05, **FCC
     )
     channel = np.unique(reads.carrier_hz, return_inverse=True)[1]
-    found = estimate_slope(reads.phase_rad, 1e-9 * reads.time_ns, channel, reads.carrier_hz)
-    np.testing.assert_allclose(found.slope_rad_hz, 0.42e-6 + 4 * np.pi * 1.5 / C, atol=0.01e-6)
+    columns = (reads.phase_rad, 1e-9 * reads.time_ns, channel, reads.carrier_hz)
+    for at_first, distance_m in ((True, 1.5), (False, 2.5)):
+        found = estimate_slope(*columns, at_first=at_first)
+        np.testing.assert_allclose(found.slope_rad_hz, 0.42e-6 + 4 * np.pi * distance_m / C, atol=0.01e-6)
 
 
 def test_robust_windows_are_as_good_on_fccs_band_as_on_chinas():

@@ -30,10 +30,12 @@ def estimate_slope(
     *,
     max_gap_s: float = 0.15,
     min_coherence: float = 0.3,
+    at_first: bool = False,
 ) -> ChannelSlope:
     """The slope that best explains the phase jumps at channel changes, corrected for motion by steps within channels.
 
-    It is that at the distance of the first read: a distance x moved since adds 4 pi x / c to it, 0.04 rad/MHz a metre.
+    A distance x adds 4 pi x / c to it, 0.04 rad/MHz a metre: it is that at the mean distance, or with `at_first` that at the
+    distance of the first read.
     Angles are doubled, so pi flips have no effect. If the jumps do not agree on a slope (coherence below
     `min_coherence`), or there are fewer than 4 hops, the offset after a hop is unknown: residual pi.
     """
@@ -58,7 +60,7 @@ def estimate_slope(
             change.append(carrier_hz[hop + 1] - carrier_hz[hop])
             at.append(hop)
     # In units of c / (4 pi): by how much the distance to the first read tilts each jump.
-    moved = np.cumsum(turned / carrier_hz[:-1])[at]
+    moved = np.cumsum(turned / carrier_hz[:-1])[at] if at_first else 0.0
     if len(jump) < 4:
         return dataclasses.replace(unknown, num_hops=len(jump))
     changes = np.asarray(change)
