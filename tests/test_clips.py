@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 import synthetic_clips as synthetic
 
+from tagjax.core.camera import working_stride
 from tagjax.core.numerics import SPEED_OF_LIGHT_M_S
 from tagjax.core.settings import ConfigError
 from tagjax.recording import Recording, RecordingError, RecordingWarning, TagReads
 from tagjax.recording.loading import VirtualTagSettings
 from tagjax.recording.reads import join_reads
-from tagjax.tracing.clips import ClipSettings, choose_antennas, load_clip
+from tagjax.tracing.clips import ClipSettings, choose_antennas, clip_loader, load_clip
 from tagjax.training.clip_dataset import clip_dataset, measured_motion
 from tagjax.training.sources import DataSettings, training_recordings
 
@@ -29,6 +30,23 @@ SMALL = {"stride": 2, "flow": "dis_ultrafast"}
 @pytest.fixture(scope="module")
 def recording() -> Recording:
     return synthetic.enlarged(synthetic.recording(20), 4)
+
+
+@pytest.mark.parametrize(
+    ("width", "stride"), [(1, 1), (256, 1), (320, 1), (512, 2), (640, 2), (960, 4), (1280, 5), (1920, 8)]
+)
+def test_the_working_resolution_follows_from_the_camera(width: int, stride: int) -> None:
+    assert working_stride(width) == stride
+    assert working_stride(width, 3) == 3
+
+
+def test_a_clip_has_about_256_columns_unless_a_stride_is_given(recording: Recording) -> None:
+    wide = synthetic.enlarged(recording, 4)  # 512 columns
+    given = load_clip(wide, 0, 6, flow="zero", stride=2)
+    for automatic in (load_clip(wide, 0, 6, flow="zero"), clip_loader(ClipSettings(flow="zero"))(wide, 0, 6)):
+        assert automatic.frames.depth_m.shape == (6, 192, 256)
+        np.testing.assert_array_equal(automatic.camera.rays, given.camera.rays)
+        np.testing.assert_array_equal(automatic.frames.depth_m, given.frames.depth_m)
 
 
 @pytest.mark.parametrize(

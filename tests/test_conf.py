@@ -60,8 +60,9 @@ def test_every_training_configuration_is_valid(override: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", ["handheld", "handheld_from_people"])
-def test_hand_held_objects_are_learned_on_every_second_pixel(experiment: str) -> None:
+def test_hand_held_objects_are_learned_at_the_resolution_of_their_tracer(experiment: str) -> None:
     config = settings(TrainConfig, "train", f"experiment={experiment}")
+    assert config.data.clips.stride is None
     assert config.data.clips.stride == tracer_clips(composed("train", "tracer=tagattention_handheld")["tracer"]).stride
 
 
@@ -103,8 +104,8 @@ def test_evaluation_configurations_are_valid() -> None:
 
 def test_a_sweep_sees_the_clips_of_its_tracer() -> None:
     suites = {"suites": suites_named(["velocity_threshold"])}
-    estimators = {"tagattention_published": "published", "tagattention_literal": "literal"}
-    for tracer, stride in (("tagattention_published", 2), ("tagattention_literal", 4)):
+    estimators = {"tagattention_published": "published", "tagattention": "robust"}
+    for tracer, stride in (("tagattention_published", None), ("tagattention", 4)):
         values = composed("sweep_paper", f"tracer={tracer}")
         values.pop("progress")
         clips = from_mapping(SweepConfig, {**values, **suites}).clip_settings()
@@ -198,7 +199,7 @@ def test_recordings_lie_in_one_place() -> None:
 
 
 def test_the_tracer_file_names_every_setting() -> None:
-    given = set(composed("train")["tracer"]) - {"_target_"}
+    given = set(composed("train")["tracer"]) - {"_target_", "clips"}
     assert given == set(inspect.signature(TagAttention).parameters)
 
 

@@ -61,7 +61,7 @@ def test_what_a_schema_holds_survives_the_round_trip() -> None:
         ({"seed": True}, "seed: found True"),
         ({"data": {"recordings": "a.zarr"}}, "expected a list of str"),
         ({"logger": {"mode": "loud"}}, "expected one of 'disabled', 'offline', 'online'"),
-        ({"data": {"clips": {"stride": None}}}, "data.clips.stride: found None"),
+        ({"data": {"clips": {"window": None}}}, "data.clips.window: found None"),
         ({"data": 3}, "expected keys and values"),
         ({"data": {"clips": {"stride": 0}}}, r"data\.clips: stride is 0; expected at least 1"),
         ({"data": {"clips": {"stride": -2}}}, r"data\.clips: stride is -2"),

@@ -25,6 +25,7 @@ from tagjax.report.overlay import MIN_WIDTH, _extent, _free_place
 from tagjax.report.report import score_table, summarise, write_report
 from tagjax.tagattention import TagAttention
 from tagjax.tagattention.frame_trace import describe
+from tagjax.tracing.clips import ClipSettings, clip_loader
 from tagjax.tracing.recordings import _tags, trace_recording
 from tagjax.tracing.tracer import Trace, trace
 
@@ -155,6 +156,18 @@ def test_working_pixels_land_on_their_own_place_in_the_picture() -> None:
     assert abs(columns.min() - box[0]) <= 1
     assert abs(rows.max() - box[3]) <= 1
     np.testing.assert_array_equal(box_to_picture(np.array([0.0, 0.0, 7.0, 5.0]), 4, 24, 32), [0, 0, 29.5, 21.5])
+
+
+def test_without_a_stride_masks_are_those_of_the_pictures_width() -> None:
+    """512 columns: clips and scores agree on every second pixel."""
+    wide = synthetic.enlarged(synthetic.recording(8), 16)
+    load = clip_loader(ClipSettings(flow="zero"))
+    settings = ScoreSettings(num_pictures=1, min_pixels=1)
+    found = evaluate_recording(synthetic.SmallTracer(), wide, load, settings=settings)
+    given = evaluate_recording(synthetic.SmallTracer(), wide, load, stride=2, settings=settings)
+    assert found.pictures[0].masks.shape[1:] == (384, 512)
+    np.testing.assert_array_equal(found.pictures[0].boxes_px, given.pictures[0].boxes_px)
+    assert to_json_values(found.scores().result()) == to_json_values(given.scores().result())
 
 
 @pytest.mark.parametrize("stride", [1, 2, 4])

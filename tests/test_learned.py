@@ -18,7 +18,7 @@ from tagjax.core.json_text import json_checksum
 from tagjax.core.settings import ConfigError
 from tagjax.tagattention import TagAttention, learned
 from tagjax.tagattention.learned import load_parameters, packaged_parameters, read_learned, save_parameters
-from tagjax.tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from tagjax.tagattention.tracer_settings import learned_tracer, make_tracer, settled, tracer_clips
 from tagjax.tracing.clips import ClipSettings
 
 CONF = str((Path(__file__).parents[1] / "conf").resolve())
@@ -168,7 +168,7 @@ def test_packaged_parameters_need_no_further_setting(weights: str) -> None:
     assert isinstance(made, TagAttention)
     assert tracer.physical() == named.physical() == made.physical()
     assert clips == same_clips == ClipSettings(stride=2)
-    assert ClipSettings().stride == 4  # without weights
+    assert ClipSettings().stride is None  # without weights: as the camera has it
 
 
 def test_clip_settings_come_back_without_the_sizes_of_buffers(tmp_path: Path) -> None:
@@ -176,6 +176,20 @@ def test_clip_settings_come_back_without_the_sizes_of_buffers(tmp_path: Path) ->
     assert learned_tracer(str(tmp_path / "weights.json"))[1] == ClipSettings(stride=2, window=3)
     kept = read_learned(tmp_path / "weights.json").clips
     assert kept == {name: value for name, value in CLIPS.items() if name != "max_reads"}
+
+
+def test_weights_learned_at_the_resolution_of_the_camera_are_used_so(tmp_path: Path) -> None:
+    save_parameters(tmp_path / "weights.json", _stirred(), SETTINGS, {**CLIPS, "stride": None})
+    assert read_learned(tmp_path / "weights.json").clips["stride"] is None
+    assert learned_tracer(str(tmp_path / "weights.json"))[1] == ClipSettings(window=3)
+
+
+@pytest.mark.parametrize(("width", "stride"), [(512, 2), (640, 2), (256, 1), (1280, 5)])
+def test_stored_scores_have_one_key_for_a_stride_given_or_automatic(width: int, stride: int) -> None:
+    automatic = {"_target_": "x", "clips": {"estimator": "published", "stride": None}}
+    given = {"_target_": "x", "clips": {"estimator": "published", "stride": stride}}
+    assert settled(automatic, width) == settled(given, width) == given
+    assert settled({"_target_": "x"}, width) == {"_target_": "x"}
 
 
 def test_a_flow_beside_the_weights_moves_with_them(tmp_path: Path) -> None:
@@ -189,8 +203,8 @@ def test_a_flow_beside_the_weights_moves_with_them(tmp_path: Path) -> None:
 
 def test_a_tracer_configuration_brings_its_clips() -> None:
     settings = _tracer_settings("tagattention_handheld")
-    assert tracer_clips(settings) == ClipSettings(stride=2)
-    assert tracer_clips(_tracer_settings("tagattention")) == ClipSettings()
+    assert tracer_clips(settings) == ClipSettings()
+    assert tracer_clips(_tracer_settings("tagattention")) == ClipSettings(stride=4)
     assert isinstance(make_tracer(settings), TagAttention)
     with pytest.raises(ConfigError, match=r"tracer\.clips: unknown key 'strid'"):
         tracer_clips({**settings, "clips": {"strid": 2}})

@@ -92,7 +92,6 @@ def _config(folder: Path, **changed) -> StreamConfig:
         recording=str(folder / "scene.zarr"),
         tracer=settings,
         flow="zero",
-        stride=1,
         num_places=2,
         replay=FAST,
         **changed,
@@ -105,9 +104,13 @@ def test_a_stream_writes_a_line_a_frame_and_a_summary(tmp_path):
     lines = [json.loads(line) for line in (tmp_path / "run/frames.jsonl").read_text().splitlines()]
     assert len(lines) == len(seen) == summary["frames"] == 24
     assert summary["dropped_frames"] == 0
+    assert summary["unused_reads"] == 1  # at the time of the first frame, which has none
+    assert summary["camera_moved"] is False
     assert not summary["interrupted"]
     assert json.loads((tmp_path / "run/stream.json").read_text())["frames"] == 24
     assert set(lines[-1]["tags"]) == {"tag-a", "tag-b"}
+    x0, _, x1, _ = lines[-1]["tags"]["tag-a"]["box_px"]  # every pixel of a picture 64 pixels wide
+    np.testing.assert_allclose([x0, x1], [8, 23], atol=1.0)
     tag = lines[-1]["tags"]["tag-a"]
     assert tag["detected"]
     assert tag["confidence"] > 0.5

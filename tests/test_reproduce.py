@@ -425,6 +425,7 @@ def test_an_interrupted_measurement_loses_one_recording_at_most(
         ({"title": "Another title"}, {}, 0),
         ({"protocols": {"part": {"frames": [0, 31], "scores": {"from_s": 0.0}}}}, {}, 4),
         ({"systems": {"online": {"tracer": "tagattention_literal", "clips": {"stride": 4}}}}, {}, 4),
+        ({"systems": {"online": {"tracer": "tagattention_literal"}}}, {}, 0),  # 512 pixels wide: every second
         ({}, {"suites": {"small": {**SUITE, "seed": 8}}}, 4),
         ({}, {"suites": {"small": {**SUITE, "about": "in other words"}}}, 0),
         ({}, {"suites": {"small": {**SUITE, "counts": {"train": 0, "validation": 0, "test": 3}}}}, 2),

@@ -119,7 +119,7 @@ def test_a_rigid_box_keeps_its_segments_and_its_increments_add_up() -> None:
         ({"max_side_px": 2}, "max_side_px is 2; expected at least min_side_px, 4"),
         ({"side_m": 0.0}, "side_m is 0.0; expected a positive value"),
         ({"depth_weight": -1.0}, "depth_weight is -1.0; expected at least 0"),
-        ({"min_pixels": 0}, "min_pixels is 0; expected an integer of at least 1"),
+        ({"min_pixels": -1}, "min_pixels is -1; expected an integer of at least 0"),
     ],
 )
 def test_impossible_settings_are_refused(settings: dict, message: str) -> None:

@@ -14,7 +14,22 @@ from .errors import RecordingError
 MAX_SIDE_PX = 16384
 """Longest side of an image that a recording may have."""
 
+WORKING_WIDTH_PX = 256
+"""Columns of the working resolution, about: as many pixels as the tracers' settings were found for."""
+
 _NUM_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
+
+
+def working_stride(width: int, stride: int | None = None) -> int:
+    """Every n-th pixel of pictures of this width is used: `stride`, or where it is None the n that leaves about 256 columns.
+
+    512 and 640 pixels give 2, 1280 gives 5, 320 and fewer give 1. Raises `ValueError` for a stride below 1.
+    """
+    if stride is None:
+        return max(1, round(width / WORKING_WIDTH_PX))
+    if stride < 1:
+        raise ValueError(f"stride is {stride}; expected at least 1 (every n-th pixel is kept).")
+    return stride
 
 
 def _finite(value: Any) -> bool:

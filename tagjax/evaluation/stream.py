@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..core.camera import working_stride
 from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..flow.registry import make_flow
@@ -35,7 +36,7 @@ class StreamConfig:
     tracer: Mapping[str, Any]
     weights: str | None = None
     flow: str = "dis"
-    stride: int | None = None  # None: that of the tracer's settings
+    stride: int | None = None  # None: that of the tracer's settings, or else of the picture's width
     num_places: int = 4  # for tags, before more are made
     replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)
 
@@ -77,7 +78,8 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
             f"tracer: found {config.tracer.get('_target_')}; expected one that runs live, as TagAttention does."
         )
     recording = open_recording(config.recording)
-    stride = config.stride or tracer_clips(config.tracer).stride
+    own = tracer_clips(config.tracer).stride if config.stride is None else config.stride
+    stride = working_stride(recording.intrinsics.width, own)
     live = LiveTracer(
         tracer,
         recording.intrinsics,
@@ -89,7 +91,7 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
         num_places=config.num_places,
     )
     start_s = live.warm_up()
-    computing, latency, num_frames, num_dropped_reads = Milliseconds(), Milliseconds(), 0, 0
+    computing, latency, num_frames, num_dropped_reads, num_unused_reads = Milliseconds(), Milliseconds(), 0, 0, 0
     begun, interrupted = time.monotonic(), False
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "frames.jsonl").open("w") as lines, contextlib.closing(Replay(recording, config.replay)) as replay:
@@ -103,6 +105,7 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
                 latency.add(done - frame.due_s)
                 num_frames += 1
                 num_dropped_reads += found.num_dropped
+                num_unused_reads += found.num_unused
                 line = _line(found, stride, recording.image_shape)
                 lines.write(json.dumps(line) + "\n")
                 if on_frame is not None:
@@ -114,6 +117,8 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
             "frames": num_frames,
             "dropped_frames": replay.num_dropped,
             "dropped_reads": num_dropped_reads,
+            "unused_reads": num_unused_reads,
+            "camera_moved": live.camera_moved,
             "frames_per_s": round(num_frames / max(time.monotonic() - begun, 1e-9), 2),
             "start_s": round(start_s, 2),
             "process_ms": computing.summary(),

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.camera import working_stride
 from ..core.files import write_atomic, writing
 from ..core.results import markdown_table, to_json_values, write_csv
 from ..core.settings import ConfigError, changed, from_mapping
@@ -24,7 +25,7 @@ from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_record
 from ..recording.store import open_recording
 from ..report.sweep import curve_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
-from ..tagattention.tracer_settings import make_tracer, tracer_clips
+from ..tagattention.tracer_settings import make_tracer, settled, tracer_clips
 from ..tracing.clips import ClipSettings, clip_loader
 
 _MAX_CURVES = 6
@@ -165,11 +166,12 @@ def _caching_loader(clips: ClipSettings) -> Callable[..., Any]:
 
 def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, Value]) -> str:
     scene = {**dataclasses.asdict(suite), "counts": None}  # the number of other recordings has no influence
+    width, clips = suite.capture.intrinsics().width, config.clip_settings()
     parts = [
         scene,
         item.name,
-        {**config.tracer, **point},
-        dataclasses.asdict(config.clip_settings()),
+        settled({**config.tracer, **point}, width),
+        dataclasses.asdict(dataclasses.replace(clips, stride=working_stride(width, clips.stride))),
         dataclasses.asdict(config.scores),
     ]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:20]

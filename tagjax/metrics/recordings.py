@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from ..core.camera import working_stride
 from ..recording import Recording, Truth
 from ..tracing.recordings import TraceSettings, trace_recording
 from ..tracing.tracer import AbstractSmoother, AbstractTracer, Trace
@@ -123,7 +124,7 @@ def evaluate_recording(
     recording: Recording,
     load: Callable[..., Any],
     *,
-    stride: int,
+    stride: int | None = None,
     epcs: Sequence[str] | None = None,
     settings: ScoreSettings | None = None,
     frames: tuple[int, int] | None = None,
@@ -131,8 +132,8 @@ def evaluate_recording(
 ) -> RecordingResult:
     """Trace a recording and score every tag whose object is labelled; without truth only pictures are returned.
 
-    Boxes and masks are compared at the size of the full picture. `stride` is that of `load`; `on_frame` is called after
-    each frame.
+    Boxes and masks are compared at the size of the full picture. `stride` is that of `load`, None the one of the
+    picture's width (`working_stride`); `on_frame` is called after each frame.
     """
     settings = settings or ScoreSettings()
     names = recording.resolve_epcs(epcs)
@@ -145,7 +146,7 @@ def score_traces(
     recording: Recording,
     names: Sequence[str],
     *,
-    stride: int = 1,
+    stride: int | None = 1,
     settings: ScoreSettings | None = None,
     frames: tuple[int, int] | None = None,
     on_frame: Callable[[], None] | None = None,
@@ -154,6 +155,7 @@ def score_traces(
     settings = settings or ScoreSettings()
     first, last = frames or (0, recording.num_frames)
     height, width = recording.image_shape
+    stride = working_stride(width, stride)
     truth = recording.truth if recording.truth is not None and recording.truth.labels is not None else None
     scored = {epc: truth.tag_to_label[epc] for epc in names if truth is not None and epc in truth.tag_to_label}
     kept = set(np.linspace(first, last - 1, settings.num_pictures).astype(int).tolist())

@@ -30,9 +30,12 @@ def estimate_slope(
     *,
     max_gap_s: float = 0.15,
     min_coherence: float = 0.3,
+    at_first: bool = False,
 ) -> ChannelSlope:
     """The slope that best explains the phase jumps at channel changes, corrected for motion by steps within channels.
 
+    A distance x adds 4 pi x / c to it, 0.04 rad/MHz a metre: it is that at the mean distance, or with `at_first` that at the
+    distance of the first read.
     Angles are doubled, so pi flips have no effect. If the jumps do not agree on a slope (coherence below
     `min_coherence`), or there are fewer than 4 hops, the offset after a hop is unknown: residual pi.
     """
@@ -46,16 +49,22 @@ def estimate_slope(
     step = np.diff(phase_rad)
     wrapped = (step + np.pi / 2) % np.pi - np.pi / 2
     rate = np.where(same & (gap > 1e-4), wrapped / np.maximum(gap, 1e-4), np.nan)
-    jump, change = [], []
+    jump, change, at = [], [], []
+    turned = np.where(same & (gap < max_gap_s), wrapped, 0.0)
     for hop in hops:
         around = rate[max(0, hop - 4) : hop + 5]
         around = around[np.isfinite(around)]
         if around.size:
-            jump.append(step[hop] - np.median(around) * gap[hop])
+            turned[hop] = np.median(around) * gap[hop]
+            jump.append(step[hop] - turned[hop])
             change.append(carrier_hz[hop + 1] - carrier_hz[hop])
+            at.append(hop)
+    # In units of c / (4 pi): by how much the distance to the first read tilts each jump.
+    moved = np.cumsum(turned / carrier_hz[:-1])[at] if at_first else 0.0
     if len(jump) < 4:
         return dataclasses.replace(unknown, num_hops=len(jump))
-    jumps, changes = np.asarray(jump), np.asarray(change)
+    changes = np.asarray(change)
+    jumps = np.asarray(jump) - changes * moved
     # Doubled phases make slopes ambiguous by pi over the channel raster; the smallest of the best is used.
     slopes = np.linspace(-MAX_SLOPE_RAD_HZ, MAX_SLOPE_RAD_HZ, 4001)
     signed = np.mean(np.cos(2 * (jumps[None, :] - slopes[:, None] * changes[None, :])), axis=1)

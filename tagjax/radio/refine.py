@@ -48,6 +48,8 @@ def refine_path(
 ) -> RefinedPath:
     """Maximum a posteriori distance at the knots, linear in between, from reads and a start within half a cycle.
 
+    `start_m` counts from the first read, as the filter's distances do: the distance moved before the window shifts phases by
+    4 pi f_r x / c, which differs by 1 rad a metre between the ends of FCC's band.
     Residuals: (phi_r - 4 pi f_r x(t_r) / c - offset) wrapped modulo pi (so that pi flips have no effect) over the
     read's noise, flattened for outliers; second differences of the knots over the acceleration prior. Solved by
     Levenberg-Marquardt (Optimistix) with implicit gradients; the covariance is the Laplace approximation.
@@ -55,13 +57,15 @@ def refine_path(
     dtype = knot_s.dtype
     weights = interpolation_weights(reads.time_s, knot_s)
     wavenumber = (4 * jnp.pi / SPEED_OF_LIGHT_M_S) * reads.carrier_hz
-    level = remove_channel_slope(reads, model, reference_hz)
+    # The path begins at 0, but not so the channels' phases: what was moved before tilts them.
+    moved_before = wavenumber * start_m[0]
+    level = remove_channel_slope(reads, model, reference_hz) - moved_before
     sigma = jnp.sqrt(jnp.square(reads.sigma_rad) + model.multipath_rad**2)
     inside = reads.valid & (reads.time_s >= knot_s[0]) & (reads.time_s <= knot_s[-1])
     precision = jnp.where(inside, 1.0 / sigma, 0.0)
     gap = jnp.maximum(jnp.diff(knot_s), 1e-3)
     # The phase offset of the start is the circular mean of the reads' residuals modulo pi.
-    doubled = 2.0 * (level - wavenumber * (weights @ start_m))
+    doubled = 2.0 * (level - wavenumber * (weights @ (start_m - start_m[0])))
     offset = 0.5 * jnp.arctan2(
         jnp.sum(precision * jnp.sin(doubled)), jnp.sum(precision * jnp.cos(doubled)) + jnp.asarray(1e-12, dtype)
     )
@@ -76,9 +80,6 @@ def refine_path(
         return jnp.concatenate([flattened, bend, ends])
 
     start = jnp.concatenate([start_m[1:] - start_m[0], (offset + jnp.zeros((), dtype))[None]])
-    # The distances of the unknowns begin at 0, so the offset absorbs the first distance of the start.
-    mean_wave = jnp.sum(precision * wavenumber) / jnp.maximum(jnp.sum(precision), 1e-9)
-    start = start.at[-1].add(mean_wave * start_m[0])
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
     solution = optx.least_squares(residuals, solver, jax.lax.stop_gradient(start), throw=False, max_steps=max_steps)
     jacobian = jax.jacfwd(residuals)(solution.value, None)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..core.build import build
+from ..core.camera import working_stride
 from ..core.settings import changed
 from ..tracing.clips import ClipSettings
 from ..tracing.tracer import AbstractTracer
@@ -48,6 +49,17 @@ def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> Abst
 def tracer_clips(settings: Mapping[str, Any]) -> ClipSettings:
     """The clip settings of a tracer's configuration; the defaults for what it does not name."""
     return changed(ClipSettings(), settings.get("clips") or {}, where="tracer.clips")
+
+
+def settled(settings: Mapping[str, Any], width: int) -> dict[str, Any]:
+    """Settings whose `clips`, if any, have the stride for pictures of this width in place of an automatic one.
+
+    Scores are stored under what determines them: a stride that follows from the width is the same as one that is given.
+    """
+    clips = settings.get("clips")
+    if not clips:
+        return dict(settings)
+    return {**settings, "clips": {**clips, "stride": working_stride(width, clips.get("stride"))}}
 
 
 def baseline_clips(baselines: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:

@@ -19,7 +19,7 @@ class UnusedReads:
 
     num_dropped: np.ndarray  # (time,) int64, of each frame: more reads than the buffer has elements
     num_other_antenna: int
-    num_unknown_carrier: int  # of the antennas that are used
+    num_unknown_carrier: int  # of the antennas that are used: reads without a carrier or a phase
 
 
 def frame_arrivals(
@@ -51,7 +51,7 @@ def frame_arrivals(
     # Frame i has the reads later than edge i and not later than edge i + 1.
     frame = np.searchsorted(edges_ns, reads.time_ns, side="left") - 1
     tag, antenna = _index(reads.epc, epcs), _index(reads.antenna, antennas)
-    known = np.isfinite(reads.carrier_hz)
+    known = np.isfinite(reads.carrier_hz) & np.isfinite(reads.phase_rad)
     arrived = (tag >= 0) & (frame >= 0) & (frame < len(frame_time_ns))
     used = arrived & (antenna >= 0) & known
     # The carrier in kHz is a number of the channel that does not depend on which reads are given.

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..core.camera import working_stride
 from ..core.geometry import pixel_rays, range_to_depth
 from ..core.settings import ConfigError
 from ..flow.cache import pair_flow
@@ -48,14 +49,14 @@ class Clip(eqx.Module):
     stop: int = eqx.field(static=True)
 
 
-def check_clip(*, stride: int = 1, window: int = 2, max_reads: int = 1) -> None:
+def check_clip(*, stride: int | None = 1, window: int = 2, max_reads: int = 1) -> None:
     """Raise `ValueError` for a stride, a window or a number of reads that no clip can have."""
     for name, value, minimum, meaning in (
         ("stride", stride, 1, "every n-th pixel is kept"),
         ("window", window, 2, "motion needs two frames"),
         ("max_reads", max_reads, 1, "reads of one tag in a window"),
     ):
-        if value < minimum:
+        if value is not None and value < minimum:
             raise ValueError(f"{name} is {value}; expected at least {minimum} ({meaning}).")
 
 
@@ -137,7 +138,7 @@ def load_clip(
     start: int,
     stop: int,
     *,
-    stride: int,
+    stride: int | None = None,
     epcs: Sequence[str] | None = None,
     flow: str = "dis",
     window: int = 5,
@@ -149,7 +150,7 @@ def load_clip(
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
-    `stride` keeps every n-th pixel in both directions. A motion vector has `window` frames, or as many as cover `window_s`
+    `stride` keeps every n-th pixel in both directions, None about 256 columns (`working_stride`). A motion vector has `window` frames, or as many as cover `window_s`
     seconds at the recording's frame rate. Ranges are estimated causally from the recording's start, so that
     a clip in the middle uses the reads before it. The constants of the reader (probability of pi flips, slope and spread
     of the channel offsets, mean carrier: `radio_model`) are fitted to all reads of the tag. `antennas` chooses the
@@ -159,6 +160,7 @@ def load_clip(
     """
     window = window if window_s is None else window_frames(window_s, recording.frame_rate_hz)
     check_clip(stride=stride, window=window, max_reads=max_reads)
+    stride = working_stride(recording.intrinsics.width, stride)
     if not 0 <= start < stop <= recording.num_frames:
         raise ValueError(f"Frames {start} to {stop} asked for; {recording.name} has {recording.num_frames}.")
     tags = selected_tags(recording, epcs)
@@ -255,7 +257,7 @@ _window_reads = jax.jit(window_reads, static_argnums=(2, 3))
 class ClipSettings:
     """How recordings become clips."""
 
-    stride: int = 4  # every n-th pixel in both directions
+    stride: int | None = None  # every n-th pixel in both directions; None: about 256 columns are left
     window: int = 5  # frames in a motion vector (k)
     window_s: float | None = None  # seconds that it covers, which then determine the number of frames
     max_reads: int = 64  # reads of one tag in a window

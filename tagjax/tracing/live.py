@@ -1,6 +1,6 @@
 """A tracer fed frame by frame as pictures and reads arrive, with tags that come and go.
 
-The tracer's step is compiled for 1, 2, 4, ..., 64 tags: a new tag takes a free place, and more places are made where there
+The tracer's step is compiled for 1, 2, 4, ..., 256 tags: a new tag takes a free place, and more places are made where there
 is none. So no tag that appears compiles anything, unless it is the first beyond one of these numbers.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,19 +18,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from ..core.camera import Intrinsics
+from ..core.camera import Intrinsics, working_stride
 from ..core.geometry import pixel_rays, range_to_depth
 from ..radio.arrivals import Arrivals
 from ..radio.reads import PhaseReads, RadioWindow
-from ..recording import TagReads
+from ..recording import RecordingWarning, TagReads
 from .arrivals import frame_arrivals
 from .clips import MAX_ARRIVALS, subsampled_depth
+from .recordings import CAMERA_MOVED
 from .tracer import Camera, Frame
 
-MAX_TAGS = 64
-"""Places for tags; beyond, the tag whose last read is oldest gives way."""
+MAX_TAGS = 256
+"""Places for tags. Beyond, new tags wait until another one has not been read for some time."""
 
-_NUM_PLACES = (1, 2, 4, 8, 16, 32, 64)
+_NUM_PLACES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _REBASE_S = 1024.0  # times on the device are float32 seconds from an origin, which is moved so often
 
 
@@ -45,6 +47,8 @@ class LiveMethod(Protocol):
 
     def shifted(self, state: Any, by_s: Array) -> Any: ...
 
+    def camera_moved(self, state: Any) -> Array | None: ...
+
 
 @dataclasses.dataclass(frozen=True)
 class LiveFrame:
@@ -54,15 +58,17 @@ class LiveFrame:
     places: dict[str, int]  # EPC -> index of the tag axis
     trace: Any  # the output of the tracer's `follow`, on the device
     num_dropped: int  # reads that the frame's buffer did not hold
+    num_unused: int  # others: of another antenna or an unknown carrier, not between the last frame and this one, or of a tag without a place
 
 
 class LiveTracer:
     """Holds a tracer's state between frames. `process` takes the next frame; frames come in order of time.
 
-    `flow` gives the flow from the first picture to the second, (height, width, 2) pixels; `stride` keeps every n-th pixel;
+    `flow` gives the flow from the first picture to the second, (height, width, 2) pixels; `stride` keeps every n-th pixel, None about 256 columns;
     `antennas` are the numbers (from 1) of those at `antennas_m`, of which reads are used. A tag that has not been read for
-    `forget_s` gives its place to a new one; there are `num_places` from the start. Raises `ValueError` for a stride below 1,
-    and for a number of places that is not 1, 2, 4, ..., 64.
+    `forget_s` gives its place to a new one; there are `num_places` from the start. Warns (`RecordingWarning`), once each, of
+    more tags than places and of a camera that moves (`camera_moved`). Raises `ValueError` for a stride below 1, for antennas
+    without a position, and for a number of places that is not 1, 2, 4, ..., 256.
     """
 
     def __init__(
@@ -72,21 +78,27 @@ class LiveTracer:
         antennas_m: np.ndarray,
         *,
         flow: Callable[[np.ndarray, np.ndarray], np.ndarray],
-        stride: int = 2,
+        stride: int | None = None,
         antennas: tuple[int, ...] = (1,),
         depth_kind: str = "depth",
         num_reads: int = MAX_ARRIVALS,
         num_places: int = 1,
         forget_s: float = 30.0,
     ):
-        if stride < 1:
-            raise ValueError(f"stride is {stride}; expected at least 1 (every n-th pixel is kept).")
+        stride = working_stride(intrinsics.width, stride)
         if num_places not in _NUM_PLACES:
             raise ValueError(f"num_places is {num_places}; expected one of {', '.join(map(str, _NUM_PLACES))}.")
         self._tracer, self._intrinsics, self._flow, self._stride = tracer, intrinsics, flow, stride
+        positions_m = np.asarray(antennas_m, np.float32)
+        known = {place + 1 for place, at_m in enumerate(positions_m) if np.all(np.isfinite(at_m))}
+        if not antennas or len(set(antennas)) < len(antennas) or not set(antennas) <= known:
+            raise ValueError(
+                f"antennas is {antennas}; expected numbers of antennas that have a position, each once: "
+                f"{', '.join(map(str, sorted(known))) or 'none has'}."
+            )
         self._antennas, self._range = antennas, depth_kind == "range"
         self._num_reads, self._forget_ns = num_reads, int(forget_s * 1e9)
-        chosen = np.asarray(antennas_m, np.float32)[np.array(antennas) - 1]
+        chosen = positions_m[np.array(antennas) - 1]
         self._camera = Camera(
             rays=jnp.asarray(pixel_rays(intrinsics.scaled(stride))), antennas_m=jnp.asarray(chosen, jnp.float32)
         )
@@ -95,23 +107,28 @@ class LiveTracer:
         self._last_read_ns: dict[str, int] = {}
         self._state: Any = None
         self._colour: np.ndarray | None = None
-        self._time_ns, self._origin_ns = 0, 0
+        self._time_ns, self._origin_ns, self._begun_ns = 0, 0, 0
+        self._crowded = False
+        self.camera_moved = False
 
     def process(self, colour: np.ndarray, depth_m: np.ndarray, time_ns: int, reads: TagReads) -> LiveFrame:
         """Trace one frame: colour (height, width, 3) uint8, depth in metres (0 = missing), and the reads since the last one.
 
-        Reads that are later than the frame are not used. Raises `ValueError` for a frame that is not later than the last.
+        Reads that are later than the frame, or not later than the last one, are not used. Depth that is not finite is
+        missing. Raises `ValueError` for a frame that is not later than the last, and for pictures of another size; the frame
+        is then left out, and the next may follow.
         """
         first = self._state is None
-        if first:
-            self._origin_ns = self._time_ns = time_ns
-        elif time_ns <= self._time_ns:
+        if not first and time_ns <= self._time_ns:
             raise ValueError(f"Found a frame at {time_ns} ns after one at {self._time_ns} ns; expected a later time.")
         height, width = self._intrinsics.height, self._intrinsics.width
         if colour.shape[:2] != (height, width) or depth_m.shape != (height, width):
             raise ValueError(
                 f"Found colour {colour.shape} and depth {depth_m.shape}; expected {height} x {width} as the intrinsics say."
             )
+        if first:
+            self._begun_ns = self._origin_ns = self._time_ns = time_ns
+        depth_m = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0)
         depth_m = range_to_depth(depth_m[None], self._intrinsics)[0] if self._range else depth_m
         depth_m = subsampled_depth(depth_m[None], self._stride)[0]
         if self._colour is None:
@@ -128,13 +145,24 @@ class LiveTracer:
         frame = self._frame((time_ns - self._origin_ns) * 1e-9, depth_m, backward_px, arrivals)
         if first:
             self._state = _init(self._tracer, self._camera, frame)
+        self._warn_of_motion()
         self._state, trace = _follow((self._tracer, self._camera, frame), self._state)
         self._colour, self._time_ns = colour, time_ns
-        if time_ns - self._origin_ns > _REBASE_S * 1e9:
-            self._state = _shifted(self._tracer, self._state, jnp.asarray(-_REBASE_S, jnp.float32))
-            self._origin_ns += int(_REBASE_S * 1e9)
+        if (later_s := (time_ns - self._origin_ns) * 1e-9 // _REBASE_S * _REBASE_S) > 0:
+            self._state = _shifted(self._tracer, self._state, jnp.asarray(-later_s, jnp.float32))
+            self._origin_ns += int(later_s * 1e9)
         places = {epc: place for place, epc in enumerate(self._places) if epc is not None}
-        return LiveFrame(time_ns, places, trace, int(unused.num_dropped.sum()))
+        num_dropped = int(unused.num_dropped.sum())
+        num_unused = reads.num_reads - num_dropped - int(np.sum(arrivals.valid))
+        return LiveFrame(time_ns, places, trace, num_dropped, num_unused)
+
+    def _warn_of_motion(self) -> None:
+        """Warn where the camera has moved before this frame: what the last one says is on the host by now."""
+        if self.camera_moved or (moved := self._tracer.camera_moved(self._state)) is None or not bool(moved):
+            return
+        self.camera_moved = True
+        at_s = (self._time_ns - self._begun_ns) * 1e-9
+        warnings.warn(CAMERA_MOVED.format(f"{at_s:.1f} s after the first frame"), RecordingWarning, stacklevel=3)
 
     def warm_up(self) -> float:
         """Compile the tracer's step on a blank frame, before the first frame comes; the seconds that it took."""
@@ -180,21 +208,31 @@ class LiveTracer:
         places: list[str | None] = list(self._places)
         for epc in new:
             if None not in places:
-                if len(places) < MAX_TAGS:
-                    places += [None] * len(places)
-                else:
-                    oldest = min((one for one in places if one), key=lambda one: self._last_read_ns[one])
-                    places[places.index(oldest)] = None
-                    del self._last_read_ns[oldest]
+                if len(places) == MAX_TAGS:
+                    self._warn_of_tags()
+                    break
+                places += [None] * len(places)
             places[places.index(None)] = epc
+        if places == self._places:
+            return
         if self._state is not None:
             source = [self._places.index(one) if one in known and one is not None else -1 for one in places]
             self._state = _with_tags(self._tracer, self._camera, self._state, jnp.asarray(source, jnp.int32))
         self._places = places
 
+    def _warn_of_tags(self) -> None:
+        if not self._crowded:
+            self._crowded = True
+            warnings.warn(
+                f"found more than {MAX_TAGS} tags; the first {MAX_TAGS} are traced. Another takes a place when one has not been "
+                f"read for {self._forget_ns * 1e-9:g} s (forget_s). Mask the tags that are of no interest at the reader.",
+                RecordingWarning,
+                stacklevel=4,
+            )
+
 
 def _no_reads(num_tags: int, num_antennas: int) -> PhaseReads:
-    zero = np.zeros((num_tags, num_antennas, 1), np.float32)
+    zero: Any = np.zeros((num_tags, num_antennas, 1), np.float32)
     return PhaseReads(zero, zero, zero, zero, zero.astype(np.int32), zero > 0)
 
 

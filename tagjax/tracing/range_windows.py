@@ -82,7 +82,8 @@ def radio_model(reads: PhaseReads, **settings: float) -> RadioModel:
     valid = np.asarray(reads.valid)
     host = {name: np.asarray(getattr(reads, name))[valid] for name in ("phase_rad", "time_s", "channel", "carrier_hz")}
     share = estimate_flip_probability(host["phase_rad"], host["time_s"], host["channel"])
-    slope = estimate_slope(host["phase_rad"], host["time_s"], host["channel"], host["carrier_hz"])
+    columns = (host[name] for name in ("phase_rad", "time_s", "channel", "carrier_hz"))
+    slope = estimate_slope(*columns, at_first=True)  # from where the filter's distances count
     chosen: dict[str, Any] = {
         "flip_probability": float(np.clip(share, 0.01, 0.45)) if np.isfinite(share) else DEFAULT_FLIP_SHARE,
         "slope_rad_hz": slope.slope_rad_hz,

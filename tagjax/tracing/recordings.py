@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -13,9 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..radio.reads import RadioWindow
-from ..recording import Recording, RecordingError
+from ..recording import Recording, RecordingError, RecordingWarning
 from ..recording.time_reversal import time_reversed
 from .tracer import AbstractSmoother, AbstractTracer, BackwardMessage, Camera, Frame, Trace
+
+CAMERA_MOVED = (
+    "the camera moved {}: nearly all of the static background shows another depth. Tracing goes on, but what the camera's "
+    "own motion adds is taken for motion of objects. Keep the camera at rest."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +126,7 @@ def _run(
     size = min(settings.tags_at_once, len(epcs))
     groups = range(0, len(epcs), size)
     states: list[Any] = [None] * len(groups)
+    moved = False
     for start in range(first, last, settings.frames_at_once):
         stop = min(start + settings.frames_at_once, last)
         overlap = int(start > first)  # the first frame of a clip has no flow: load it with the frame before
@@ -141,6 +148,16 @@ def _run(
                 states[number], out = step(tracer, clip.camera, states[number], frame)
                 outputs.append(jax.tree.map(np.asarray, out))
             yield start - overlap + index, outputs
+        moved = moved or _warn_of_motion(tracer, states[0], recording.name, stop)
+
+
+def _warn_of_motion(tracer: AbstractTracer, state: Any, name: str, stop: int) -> bool:
+    """Warn where the camera has moved; whether it has."""
+    flag = tracer.camera_moved(state)
+    if flag is None or not bool(flag):
+        return False
+    warnings.warn(f"{name}: {CAMERA_MOVED.format(f'before frame {stop}')}", RecordingWarning, stacklevel=4)
+    return True
 
 
 def _backward_pass(

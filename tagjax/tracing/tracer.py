@@ -90,6 +90,10 @@ class AbstractTracer(eqx.Module):
     def finish(self, state: Any) -> Any:
         """The state from which a later part of the recording continues; it holds no reference to a past frame's buffer."""
 
+    def camera_moved(self, state: Any) -> Bool[Array, ""] | None:
+        """Whether the camera has moved so far, which misleads a method that expects it at rest; None: it does not find out."""
+        return None
+
 
 class AbstractSmoother(AbstractTracer):
     """A tracer with a backward pass, whose messages the forward pass of offline smoothing uses."""

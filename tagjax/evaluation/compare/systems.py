@@ -93,8 +93,8 @@ class Systems:
             return "starting widths" if self.settings.goller_calibration is None else "fitted widths"
         return self.settings_name(name, item)
 
-    def stride(self, name: str, item: Item) -> int:
-        """The stride in pixels of a system's masks."""
+    def stride(self, name: str, item: Item) -> int | None:
+        """The stride in pixels of a system's masks; None for that of the picture's width."""
         settings = self._device_settings(name, item)
         return 1 if settings is None else tracer_clips(settings).stride
 

@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from ...core.camera import working_stride
 from ...core.settings import changed
 from ...recording import Recording
 from ...sim.flow_truth import with_exact_flow
@@ -75,16 +76,16 @@ def swapped_traces(
     for swap in swaps:
         recording = swap.recording(item, recording)
         clips = changed(clips, swap.clips, where="clips")
-    load = clip_loader(clips)
+    load, stride = clip_loader(clips), working_stride(recording.intrinsics.width, clips.stride)
 
     def swapped_clip(recording: Recording, start: int, stop: int, *, epcs: Sequence[str] | None = None) -> Clip:
         clip = load(recording, start, stop, epcs=epcs)
-        return functools.reduce(lambda one, swap: swap.clip(one, recording, clips.stride), swaps, clip)
+        return functools.reduce(lambda one, swap: swap.clip(one, recording, stride), swaps, clip)
 
     traces = trace_recording(tracer, recording, swapped_clip, epcs=epcs, settings=run)
     for swap in swaps:
-        traces = swap.traces(traces, recording, epcs, clips.stride)
-    return traces, epcs, clips.stride
+        traces = swap.traces(traces, recording, epcs, stride)
+    return traces, epcs, stride
 
 
 def _tracer(settings: Mapping[str, Any], swaps: Collection[Swap]) -> AbstractTracer:

@@ -12,12 +12,13 @@ from typing import Any
 
 from ...baselines import AbstractHostTracer, host_trace
 from ...baselines.blobs import BlobSettings, BlobTracer
+from ...core.camera import working_stride
 from ...core.results import to_json_values, write_json
 from ...core.settings import ConfigError, changed, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording, score_traces
 from ...recording.store import open_recording
 from ...sim.suites import Item, Suite, make_items
-from ...tagattention.tracer_settings import learned_tracer, make_tracer, tracer_clips
+from ...tagattention.tracer_settings import learned_tracer, make_tracer, settled, tracer_clips
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
 from ...training.evaluate import parameters
@@ -116,13 +117,15 @@ class Tracing:
         suite = dataclasses.asdict(item.suite)
         for name in ("about", "paper", "counts", "variants"):  # about other recordings, or descriptions
             del suite[name]
+        width = item.suite.capture.intrinsics().width
+        clips = dataclasses.replace(self.clips, stride=working_stride(width, self.clips.stride))
         on_host = isinstance(self.tracer, AbstractHostTracer)
         learned = {} if isinstance(self.tracer, AbstractHostTracer) else parameters(self.tracer)
         everything = {
             "recording": {"suite": suite, "variant": dataclasses.asdict(item.variant), "seed": item.seed},
             "name": item.name,
-            "tracer": {"settings": self.settings, "parameters": learned},
-            "clips": {} if on_host else dataclasses.asdict(self.clips),
+            "tracer": {"settings": settled(self.settings, width), "parameters": learned},
+            "clips": {} if on_host else dataclasses.asdict(clips),
             "scores": dataclasses.asdict(self.scores_settings),
             "frames": self.frames,
             "code": {

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...core.constrained import Fraction, Positive
 from ...radio.reads import RadioWindow
 from ..attention import att_corr, att_rbf, attention, centre_first
-from ..propagation import radio_speed, velocity_gate
+from ..propagation import log_likelihood_ratio, radio_speed, velocity_gate
 
 
 class VelocityGate(eqx.Module):
@@ -40,17 +40,19 @@ class AttentionState(eqx.Module):
     """The segments' distances over the window, and what has been propagated."""
 
     distance_m: Float[Array, "antenna segment window"]  # sums of increments
-    known: Bool[Array, "segment window"]  # the segment existed, and its increment was measured
+    known: Bool[Array, "segment window"]  # the segment existed, and all its increments since were measured
     time_s: Float[Array, " window"]
     log_likelihood: Float[Array, "tag segment"]
 
     @staticmethod
-    def nothing(num_tags: int, num_antennas: int, num_segments: int, num_window: int) -> AttentionState:
-        """Before the first frame."""
+    def nothing(
+        num_tags: int, num_antennas: int, num_segments: int, num_window: int, time_s: Float[Array, ""]
+    ) -> AttentionState:
+        """Before the first frame, which is at `time_s`."""
         return AttentionState(
             distance_m=jnp.zeros((num_antennas, num_segments, num_window)),
             known=jnp.zeros((num_segments, num_window), bool),
-            time_s=jnp.zeros(num_window),
+            time_s=jnp.broadcast_to(time_s, (num_window,)),
             log_likelihood=jnp.zeros((num_tags, num_segments)),
         )
 
@@ -109,7 +111,8 @@ class AttentionEvidence(eqx.Module):
         carried = jnp.where(new[None], lowest, state.log_likelihood[:, source])
         now_m = before_m[..., -1:] + increment_m[..., None]
         distance_m = jnp.concatenate([before_m[..., 1:], now_m], axis=-1)
-        valid = jnp.concatenate([was_known[:, 1:], known[:, None]], axis=-1)
+        # Where this frame's increment is missing nothing connects now with before.
+        valid = jnp.concatenate([was_known[:, 1:] & known[:, None], jnp.ones((known.shape[0], 1), bool)], axis=-1)
         time_s = jnp.concatenate([state.time_s[1:], now_s[None]])
         rho_m = centre_first(distance_m, jnp.broadcast_to(valid, distance_m.shape))
         full = jnp.all(valid, axis=-1)
@@ -118,7 +121,7 @@ class AttentionEvidence(eqx.Module):
             alpha = jnp.broadcast_to(self.alpha_m2.value, (1,))
             rbf, corr = att_rbf(rho, rd[None], valid, alpha), att_corr(rho, rd[None], valid)
             agreed = attention(rbf, corr, self.beta.value)
-            return jnp.log(jnp.where(full, agreed, 0.0) + self.floor.value)
+            return log_likelihood_ratio(jnp.where(full, agreed, 0.0), jnp.ones(()), self.floor.value)
 
         def of_tag(one: RadioWindow, likelihood: Float[Array, " segment"]) -> Float[Array, " segment"]:
             known_radio = jnp.all(jnp.isfinite(one.std_m), axis=-1)

@@ -46,6 +46,12 @@ class BackgroundView(eqx.Module):
     still: Bool[Array, "height width"]  # no apparent motion
     lost: Float[Array, ""]  # fraction of the pixels with depth and a confirmed surface that show another; 0 without any
 
+    @staticmethod
+    def nothing(height: int, width: int) -> BackgroundView:
+        """No pixel is known to be background."""
+        no, zero = jnp.zeros((height, width), bool), jnp.zeros((height, width))
+        return BackgroundView(no, no, zero, no, no, no, jnp.zeros(()))
+
 
 class Background(eqx.Module):
     """Settings of the background model.

@@ -19,7 +19,6 @@ from .labels import STATIC, slot_sums
 
 _SAME_SURFACE = 0.03  # taps whose depth differs from the nearest tap's by less than this fraction
 _MIN_WEIGHT = 1e-3
-_MIN_PIXELS = 2
 
 
 # x, y, z: three maps, not one of three channels, which XLA gathers from several times as slowly on a CPU.
@@ -31,7 +30,7 @@ class SegmentMotion(eqx.Module):
 
     increment_m: Float[Array, "antenna segment"]  # change of the range
     motion_m: Float[Array, "segment 3"]  # camera frame
-    known: Bool[Array, " segment"]  # at least two pixels were measured; the static background's is known to be 0
+    known: Bool[Array, " segment"]  # enough pixels were measured; the static background's is known to be 0
 
 
 def pixel_sources(
@@ -94,8 +93,9 @@ def segment_motion(
     backward_px: Float[Array, "height width 2"],
     max_change_m: Float[Array, ""],
     num_segments: int,
+    min_pixels: int = 2,
 ) -> SegmentMotion:
-    """Each segment's mean change over its `counted` pixels of known source; 0 with fewer than two of them, and in slot 0.
+    """Each segment's mean change over its `counted` pixels of known source; 0 with fewer than `min_pixels`, and in slot 0.
 
     A source whose depth differs by `max_change_m` or more is another surface.
     Labels are constants; the gradient flows through depth and flow.
@@ -106,7 +106,7 @@ def segment_motion(
     ranges = [_range_m(points, antenna) - _range_m(before, antenna) for antenna in camera.antennas_m]
     changes = [*ranges, *(now - then for now, then in zip(points, before, strict=True))]
     number, *summed = slot_sums([jnp.ones_like(depth_m), *changes], measured, labels, num_segments)
-    enough = number >= _MIN_PIXELS
+    enough = number >= min_pixels
     means = jnp.stack([jnp.where(enough, total / jnp.where(enough, number, 1.0), 0.0) for total in summed])
     num_antennas = len(ranges)
     known_segment = enough | (jnp.arange(num_segments) == STATIC)

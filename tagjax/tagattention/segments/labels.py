@@ -72,7 +72,8 @@ class Segmenter(eqx.Module):
     Good values: the defaults. `side_m` 0.05 is less than the width of a forearm; `reach` (squared distance from a segment's
     centre, in sides, beyond which a pixel is not assigned to it) 2, up to 4 alike; `depth_weight` 0.5 (depth of a side counts as half a
     side); `moved_m` 0.03; `max_speed_m_s` 2 of the depth of a surface. `start_side_px` is chosen so that the first frame
-    takes at most 3/4 of the slots where it is None. Raises `ValueError` for values that are not positive.
+    takes at most 3/4 of the slots where it is None. Sides of 1 and `min_pixels` 0 make a segment of each pixel. Raises
+    `ValueError` for values that are not positive, but for `min_pixels`.
     """
 
     num_segments: int = eqx.field(static=True, default=2048)
@@ -80,17 +81,19 @@ class Segmenter(eqx.Module):
     min_side_px: int = eqx.field(static=True, default=4)
     max_side_px: int = eqx.field(static=True, default=12)
     start_side_px: int | None = eqx.field(static=True, default=None)
-    min_pixels: int = eqx.field(static=True, default=4)
+    min_pixels: int = eqx.field(static=True, default=4)  # segments with fewer end, new ones have more
     reach: float = eqx.field(static=True, default=2.0)
     depth_weight: float = eqx.field(static=True, default=0.5)
     moved_m: float = eqx.field(static=True, default=0.03)
     max_speed_m_s: float = eqx.field(static=True, default=2.0)
 
     def __check_init__(self) -> None:
-        whole = ("num_segments", "min_side_px", "max_side_px", "min_pixels")
+        whole = ("num_segments", "min_side_px", "max_side_px")
         check_positive_integers(**{name: getattr(self, name) for name in whole})
         lengths = ("side_m", "reach", "moved_m", "max_speed_m_s")
         check_positive(**{name: getattr(self, name) for name in lengths})
+        if not (isinstance(self.min_pixels, int) and self.min_pixels >= 0):
+            raise ValueError(f"min_pixels is {self.min_pixels}; expected an integer of at least 0.")
         if not self.depth_weight >= 0:
             raise ValueError(f"depth_weight is {self.depth_weight}; expected at least 0.")
         if self.num_segments < 2:
@@ -117,6 +120,11 @@ class Segmenter(eqx.Module):
         while height * width > _START_FRACTION * self.num_segments * side**2 or num_blocks(side) >= self.num_segments:
             side += 1
         return side
+
+    @property
+    def min_measured(self) -> int:
+        """A segment's motion is known from so many measured pixels on."""
+        return 2 if self.min_pixels > 0 else 1
 
     def max_change_m(self, dt_s: Float[Array, ""]) -> Float[Array, ""]:
         """A surface's depth changes by less than this in `dt_s`."""
@@ -175,7 +183,7 @@ class Segmenter(eqx.Module):
         )
         one = jnp.ones_like(depth_m)
         (number,) = slot_sums([one], labels > 0, labels, self.num_segments)
-        small = number < self.min_pixels
+        small = number < max(self.min_pixels, 1)
         free = small & (jnp.arange(self.num_segments) != STATIC)
         labels = jnp.where((labels > 0) & ~small[jnp.maximum(labels, 0)], labels, NO_LABEL)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...tracing.tracer import Camera
-from .background import Background, BackgroundState
+from .background import Background, BackgroundState, BackgroundView
 from .carry import on_surface
 from .cells import NO_LABEL, NOT_NEW
 from .increments import segment_motion
@@ -38,20 +38,24 @@ class SegmentFrame(eqx.Module):
 class SegmentTrackerState(eqx.Module):
     """What is carried from frame to frame."""
 
-    background: BackgroundState
+    background: BackgroundState | None
     segments: SegmentState
 
 
 class SegmentTracker(eqx.Module):
-    """Persistent segments of whatever moves, from depth and backward flow. `SegmentTracker()` has good values."""
+    """Persistent segments of whatever moves, from depth and backward flow. `SegmentTracker()` has good values.
 
-    background: Background = eqx.field(default_factory=Background)
+    Without a `background` nothing is static: every pixel belongs to a segment.
+    """
+
+    background: Background | None = eqx.field(default_factory=Background)
     segmenter: Segmenter = eqx.field(default_factory=Segmenter)
 
     def init(self, camera: Camera) -> SegmentTrackerState:
         """The state before the first frame. Raises `ValueError` where the first frame would need too many slots."""
         height, width, _ = camera.rays.shape
-        return SegmentTrackerState(self.background.init(height, width), self.segmenter.init(height, width))
+        background = None if self.background is None else self.background.init(height, width)
+        return SegmentTrackerState(background, self.segmenter.init(height, width))
 
     def step(
         self,
@@ -69,13 +73,15 @@ class SegmentTracker(eqx.Module):
         """
         backward_px = jnp.where(jnp.isfinite(backward_px), backward_px, 0.0)
         valid, focal = on_surface(depth_m), focal_px(camera)
-        background, view = self.background.step(state.background, depth_m, valid, backward_px, dt_s, focal)
+        background, view = None, BackgroundView.nothing(*depth_m.shape)
+        if self.background is not None and state.background is not None:
+            background, view = self.background.step(state.background, depth_m, valid, backward_px, dt_s, focal)
         segments, found = self.segmenter.step(
             state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal
         )
         motion = segment_motion(
             camera, segments.labels, found.counted, depth_m, state.segments.depth_m, backward_px,
-            self.segmenter.max_change_m(dt_s), self.segmenter.num_segments,
+            self.segmenter.max_change_m(dt_s), self.segmenter.num_segments, self.segmenter.min_measured,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
         seen = jnp.any(valid)

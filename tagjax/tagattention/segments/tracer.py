@@ -27,6 +27,7 @@ from ...radio.reader_model import ReaderModel
 from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody
+from .cut import cut_segments
 from .detection import Detection
 from .dwell import DwellEvidence, DwellState
 from .hidden import HiddenBody, HiddenState
@@ -43,15 +44,18 @@ from .step import SegmentFrame, SegmentTracker, SegmentTrackerState
 from .travel import TravellingTogether, TravelState
 from .whole import WholeBody
 
+CAMERA_MOVED_FRACTION = 0.8
+"""Of the static background that shows another depth, in two frames: the camera moved. People in front of it cover less."""
+
 
 class TagState(eqx.Module):
-    """What is carried from frame to frame of each tag, and of the motion that all share."""
+    """What is carried from frame to frame of the tags, and of the motion that all of them share."""
 
     time_s: Float[Array, ""]  # of the last frame; NaN before the first
     travel: TravelState | None
-    dwell: DwellState
+    dwell: DwellState | None
     attention: AttentionState | None
-    body: BodyState
+    body: BodyState | None
     hidden: HiddenState | None
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
 
@@ -61,6 +65,8 @@ class TagAttentionState(eqx.Module):
 
     segments: SegmentTrackerState
     tags: TagState
+    background_lost: Float[Array, ""]  # of the last frame, as in `SegmentFrame`
+    camera_moved: Bool[Array, ""]  # so far
 
 
 class Association(eqx.Module):
@@ -86,117 +92,57 @@ class SegmentTrace(eqx.Module):
 
 
 class TagAttention(AbstractTracer):
-    """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values; None is a stage that is off."""
+    """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values.
+
+    None is a stage that is off. Without `body` the segments that explain the reads best are the object (`cut_segments`).
+    Raises `ValueError` without any evidence, for `hidden`, which remembers dwells, without them, and for `whole` without
+    a body to complete.
+    """
 
     segments: SegmentTracker = eqx.field(default_factory=SegmentTracker)
     travel: TravellingTogether | None = eqx.field(default_factory=TravellingTogether)
     reader: ReaderModel = eqx.field(default_factory=ReaderModel)
-    dwell: DwellEvidence = eqx.field(default_factory=DwellEvidence)
+    dwell: DwellEvidence | None = eqx.field(default_factory=DwellEvidence)
     attention: AttentionEvidence | None = None
-    body: CarryingBody = eqx.field(default_factory=CarryingBody)
+    body: CarryingBody | None = eqx.field(default_factory=CarryingBody)
     whole: WholeBody | None = eqx.field(default_factory=WholeBody)
     hidden: HiddenBody | None = eqx.field(default_factory=HiddenBody)
     detection: Detection = eqx.field(default_factory=Detection)
 
+    def __check_init__(self) -> None:
+        if self.dwell is None and self.attention is None:
+            raise ValueError("dwell and attention are both off; expected at least one: nothing else uses the reads.")
+        if self.hidden is not None and self.dwell is None:
+            raise ValueError("hidden is on and dwell is off; expected dwell for it. Set hidden to null.")
+        if self.whole is not None and self.body is None:
+            raise ValueError("whole is on and body is off; expected a body that it completes. Set whole to null.")
+
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         """The state before the first frame."""
         assert frame.present is not None
-        num_window = 0 if self.attention is None else frame.radio.relative_m.shape[-1]
-        tags = self._no_reads(frame.present.shape[-1], camera.antennas_m.shape[0], num_window)
-        return TagAttentionState(self.segments.init(camera), tags)
+        num_tags, num_window = frame.present.shape[-1], frame.radio.relative_m.shape[-1]
+        return TagAttentionState(
+            segments=self.segments.init(camera),
+            tags=self._no_reads(num_tags, camera.antennas_m.shape[0], num_window, frame.time_s),
+            background_lost=jnp.zeros(()),
+            camera_moved=jnp.zeros((), bool),
+        )
 
-    def _no_reads(self, num_tags: int, num_antennas: int, num_window: int) -> TagState:
+    def _no_reads(self, num_tags: int, num_antennas: int, num_window: int, time_s: Float[Array, ""]) -> TagState:
         num_segments = self.segments.segmenter.num_segments
-        attention = None
+        dwell = attention = None
+        if self.dwell is not None:
+            dwell = DwellState.nothing(num_tags, num_antennas, num_segments)
         if self.attention is not None:
-            attention = AttentionState.nothing(num_tags, num_antennas, num_segments, num_window)
+            attention = AttentionState.nothing(num_tags, num_antennas, num_segments, num_window, time_s)
         return TagState(
             time_s=jnp.asarray(jnp.nan, jnp.float32),
             travel=None if self.travel is None else self.travel.init(num_segments),
-            dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
+            dwell=dwell,
             attention=attention,
-            body=self.body.init(num_tags, num_segments),
+            body=None if self.body is None else self.body.init(num_tags, num_segments),
             hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
             num_reads=jnp.zeros(num_tags),
-        )
-
-    def associate(self, state: TagState, found: SegmentFrame, frame: Frame) -> tuple[TagState, Association]:
-        """The next state of the tags and their bodies, from a frame's segments and reads."""
-        assert frame.arrivals is not None
-        assert frame.present is not None
-        now_s = frame.time_s
-        since_s = jnp.where(jnp.isfinite(state.time_s), state.time_s, now_s)
-        dt_s = now_s - since_s
-        travel, pooling = state.travel, None
-        if self.travel is not None and travel is not None:
-            travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
-        dwell, log_likelihood = self.dwell.step(
-            self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
-        )
-        hidden = state.hidden
-        if self.hidden is not None and hidden is not None:
-            log_likelihood = self.hidden.inherited(hidden, log_likelihood, found.centre_m, found.source > -2)
-        if self.travel is not None and pooling is not None:
-            log_likelihood = self.travel.heal(pooling, log_likelihood, dt_s)
-        dwell = eqx.tree_at(lambda d: d.log_likelihood, dwell, log_likelihood)
-        attention = state.attention
-        if self.attention is not None and attention is not None:
-            attention, agreed = self.attention.step(
-                attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
-            )
-            log_likelihood = log_likelihood + self.attention.weight.value * agreed
-        evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
-        body, bodies = self.body.step(
-            state.body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
-            since_s, now_s,
-        )  # fmt: skip
-        membership = jax.nn.sigmoid(bodies.log_odds)
-        if self.whole is not None:
-            moved = body.past.since(self.whole.lag_s, found.displacement_m, found.life_s, now_s)
-            membership = self.whole.completed(membership, found, *moved)
-        membership = jnp.where(frame.present[:, None], membership, 0.0)
-        weight = membership * found.area[None]
-        total = jnp.sum(weight, axis=1)
-
-        def mean(values: Float[Array, "... segment"]) -> Float[Array, "tag ..."]:
-            return safe_divide(weight @ values, jnp.broadcast_to(total[:, None], (total.shape[0], values.shape[-1])))
-
-        body_nats = safe_divide(jnp.sum(weight * log_likelihood, axis=1), total)
-        body_nats = jnp.where(total > 0, body_nats, -1e4)
-        hides = jnp.zeros(total.shape, bool)
-        if self.hidden is not None and hidden is not None:
-            velocity = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
-            kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
-            hidden, hides = self.hidden.step(hidden, body_nats, mean(found.centre_m), velocity, kept, dt_s)
-        num_reads = self.detection.received(state.num_reads, frame.arrivals, since_s, now_s)
-        confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
-        in_view = jnp.any(membership > 0.5, axis=1)
-        confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
-        out = Association(
-            membership=membership,
-            centre_m=mean(found.centre_m),
-            step_m=mean(found.increment_m.T),
-            body_nats=body_nats,
-            stationary_nats=log_likelihood[:, STATIC],
-            num_reads=num_reads,
-            confidence=confidence,
-            detected=self.detection.detected(confidence),
-        )
-        return TagState(now_s, travel, dwell, attention, body, hidden, num_reads), out
-
-    def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
-        """The next state and the output on segments, without dense masks."""
-        last_s = state.tags.time_s
-        dt_s = jnp.where(jnp.isfinite(last_s), frame.time_s - last_s, 0.0)
-        segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, dt_s)
-        tags, out = self.associate(state.tags, found, frame)
-        labels = filled_labels(found.labels, frame.depth_m)
-        num_segments, member = found.area.shape[0], out.membership > 0.5
-        return TagAttentionState(segments, tags), SegmentTrace(
-            labels=labels,
-            box_px=joined_boxes(segment_boxes(labels, num_segments), member),
-            centre_px=joined_centroids(segment_centroids(labels, num_segments), member),
-            tags=out,
         )
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
@@ -213,26 +159,125 @@ class TagAttention(AbstractTracer):
             detected=tags.detected,
         )
 
+    def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
+        """The next state and the output on segments, without dense masks."""
+        dt_s = frame.time_s - _last_s(state.tags, frame)
+        segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, dt_s)
+        tags, out = self.associate(state.tags, found, frame)
+        labels = filled_labels(found.labels, frame.depth_m)
+        num_segments, member = found.area.shape[0], out.membership > 0.5
+        # A single frame's wrong depth is no motion; a deeper surface is accepted as background within two or three.
+        lost = jnp.minimum(state.background_lost, found.background_lost) > CAMERA_MOVED_FRACTION
+        after = TagAttentionState(segments, tags, found.background_lost, state.camera_moved | lost)
+        return after, SegmentTrace(
+            labels=labels,
+            box_px=joined_boxes(segment_boxes(labels, num_segments), member),
+            centre_px=joined_centroids(segment_centroids(labels, num_segments), member),
+            tags=out,
+        )
+
+    def associate(self, state: TagState, found: SegmentFrame, frame: Frame) -> tuple[TagState, Association]:
+        """The next state of the tags and their bodies, from a frame's segments and reads."""
+        assert frame.arrivals is not None
+        assert frame.present is not None
+        now_s, since_s = frame.time_s, _last_s(state, frame)
+        dt_s = now_s - since_s
+        travel, pooling = state.travel, None
+        if self.travel is not None and travel is not None:
+            travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
+        dwell, log_likelihood = state.dwell, jnp.zeros((frame.present.shape[0], found.area.shape[0]))
+        if self.dwell is not None and dwell is not None:
+            dwell, log_likelihood = self.dwell.step(
+                self.reader, dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
+            )
+            if self.hidden is not None and state.hidden is not None:
+                newborn = found.source > -2
+                log_likelihood = self.hidden.inherited(state.hidden, log_likelihood, found.centre_m, newborn)
+            if self.travel is not None and pooling is not None:
+                log_likelihood = self.travel.heal(pooling, log_likelihood, dt_s)
+            dwell = eqx.tree_at(lambda one: one.log_likelihood, dwell, log_likelihood)
+        attention = state.attention
+        if self.attention is not None and attention is not None:
+            attention, agreed = self.attention.step(
+                attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
+            )
+            log_likelihood = log_likelihood + self.attention.weight.value * agreed
+        body, membership = self._bodies(state.body, log_likelihood, found, since_s, now_s)
+        membership = jnp.where(frame.present[:, None], membership, 0.0)
+        weight = membership * found.area[None]
+        total = jnp.sum(weight, axis=1)
+
+        def mean(values: Float[Array, "... segment"]) -> Float[Array, "tag ..."]:
+            return safe_divide(weight @ values, jnp.broadcast_to(total[:, None], (total.shape[0], values.shape[-1])))
+
+        body_nats = safe_divide(jnp.sum(weight * log_likelihood, axis=1), total)
+        body_nats = jnp.where(total > 0, body_nats, -1e4)
+        hidden, hides = state.hidden, jnp.zeros(total.shape, bool)
+        if self.hidden is not None and hidden is not None and self.dwell is not None:
+            velocity = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
+            kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
+            hidden, hides = self.hidden.step(hidden, body_nats, mean(found.centre_m), velocity, kept, dt_s)
+        num_reads = self.detection.received(state.num_reads, frame.arrivals, since_s, now_s)
+        confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
+        in_view = jnp.any(membership > 0.5, axis=1)
+        confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
+        return TagState(now_s, travel, dwell, attention, body, hidden, num_reads), Association(
+            membership=membership,
+            centre_m=mean(found.centre_m),
+            step_m=mean(found.increment_m.T),
+            body_nats=body_nats,
+            stationary_nats=log_likelihood[:, STATIC],
+            num_reads=num_reads,
+            confidence=confidence,
+            detected=self.detection.detected(confidence),
+        )
+
+    def _bodies(
+        self,
+        state: BodyState | None,
+        log_likelihood: Float[Array, "tag segment"],
+        found: SegmentFrame,
+        since_s: Float[Array, ""],
+        now_s: Float[Array, ""],
+    ) -> tuple[BodyState | None, Float[Array, "tag segment"]]:
+        """The state of the bodies, and the probability that each segment belongs to each tag's."""
+        if self.body is None or state is None:
+            moving = (found.area > 0) & (jnp.arange(found.area.shape[0]) != STATIC)
+            return None, cut_segments(log_likelihood, moving)
+        evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
+        state, bodies = self.body.step(
+            state, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source, since_s, now_s
+        )  # fmt: skip
+        membership = jax.nn.sigmoid(bodies.log_odds)
+        if self.whole is not None:
+            moved = state.past.since(self.whole.lag_s, found.displacement_m, found.life_s, now_s)
+            membership = self.whole.completed(membership, found, *moved)
+        return state, membership
+
+    def camera_moved(self, state: TagAttentionState) -> Bool[Array, ""]:
+        """Whether in two frames one after the other nearly all of the static background showed another depth."""
+        return state.camera_moved
+
     def finish(self, state: Any) -> Any:
         """The state itself: it holds no buffer of a frame."""
         return state
 
     def with_tags(self, camera: Camera, state: TagAttentionState, source: Int[Array, " tag"]) -> TagAttentionState:
         """The state for other tags: `source` is each one's place among the present ones, -1 for a new tag."""
-        num_window = 0 if state.tags.attention is None else state.tags.attention.num_window
-        fresh = self._no_reads(source.shape[0], camera.antennas_m.shape[0], num_window)
+        num_window = 1 if state.tags.attention is None else state.tags.attention.num_window
+        fresh = self._no_reads(source.shape[0], camera.antennas_m.shape[0], num_window, state.tags.time_s)
 
         def moved(new: Array, old: Array) -> Array:
             known = (source >= 0).reshape(-1, *[1] * (new.ndim - 1))
             return jnp.where(known, old[jnp.maximum(source, 0)], new)
 
         leaves = [moved(new, old) for new, old in zip(_of_tags(fresh), _of_tags(state.tags), strict=True)]
-        return TagAttentionState(state.segments, eqx.tree_at(_of_tags, state.tags, leaves))
+        return eqx.tree_at(lambda one: one.tags, state, eqx.tree_at(_of_tags, state.tags, leaves))
 
     def shifted(self, state: TagAttentionState, by_s: Float[Array, ""]) -> TagAttentionState:
         """The state with all times later by `by_s`: for another origin of time."""
-        times = _times(state.tags)
-        return TagAttentionState(state.segments, eqx.tree_at(_times, state.tags, [one + by_s for one in times]))
+        later = eqx.tree_at(_times, state.tags, [one + by_s for one in _times(state.tags)])
+        return eqx.tree_at(lambda one: one.tags, state, later)
 
     def physical(self) -> dict[str, float]:
         """The learnable parameters in physical units, by dotted name."""
@@ -243,21 +288,27 @@ class TagAttention(AbstractTracer):
         return with_named_values(self, values)
 
 
+def _last_s(state: TagState, frame: Frame) -> Float[Array, ""]:
+    """The time of the last frame, that of this one before the first. A time that goes back counts as that of the last frame."""
+    return jnp.where(jnp.isfinite(state.time_s), jnp.minimum(state.time_s, frame.time_s), frame.time_s)
+
+
 def _of_tags(state: TagState) -> list[Any]:
     """The arrays with one row a tag."""
-    dwell = state.dwell
-    found = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
-    found += [state.body.membership, state.num_reads]
+    found = [state.num_reads, *jax.tree.leaves(state.hidden)]
+    if state.dwell is not None:
+        dwell = state.dwell
+        found += [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
     if state.attention is not None:
         found.append(state.attention.log_likelihood)
-    return found + jax.tree.leaves(state.hidden)
+    return found if state.body is None else [*found, state.body.membership]
 
 
 def _times(state: TagState) -> list[Any]:
     """The arrays of times."""
-    found = [state.time_s, state.body.past.time_s]
+    found = [state.time_s]
     if state.travel is not None:
         found.append(state.travel.past.time_s)
     if state.attention is not None:
         found.append(state.attention.time_s)
-    return found
+    return found if state.body is None else [*found, state.body.past.time_s]
