@@ -11,7 +11,7 @@ import math
 import operator
 import reprlib
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -65,6 +65,21 @@ class Fraction(eqx.Module):
 def named_values(module: eqx.Module) -> dict[str, float]:
     """The learnable scalars of a module and of the modules in it, in physical units, by dotted name (`body.rigid.noise_m`)."""
     return {name: _value(leaf) for name, leaf in _named(module).items()}
+
+
+def static_settings(module: eqx.Module) -> dict[str, Any]:
+    """The static fields of a module and of the modules in it by dotted name (`body.num_rounds`), tuples as lists.
+
+    A part that is off is None under its own name.
+    """
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name)
+        if field.metadata.get("static", False) or value is None:
+            found[field.name] = list(value) if isinstance(value, tuple) else value
+        elif isinstance(value, eqx.Module) and not isinstance(value, Positive | Fraction):
+            found |= {f"{field.name}.{name}": inner for name, inner in static_settings(value).items()}
+    return found
 
 
 def with_named_values(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
