@@ -161,7 +161,7 @@ def _check_target(found: Learned, settings: Mapping[str, Any]) -> None:
     learned, asked = found.settings.get("_target_"), settings.get("_target_")
     if learned != asked:
         raise ValueError(
-            f"{found.path}: found parameters of the tracer {reprlib.repr(learned)}; expected those of {asked}. Choose the "
+            f"{found.path}: found parameters of the tracer {str(learned)[:100]}; expected those of {asked}. Choose the "
             "tracer that they were learned with (tracer=), or other weights (weights=)."
         )
 

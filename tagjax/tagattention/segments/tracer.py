@@ -85,7 +85,7 @@ class TagAttention(AbstractTracer):
         num_tags, num_antennas = frame.present.shape[-1], camera.antennas_m.shape[0]
         num_segments = self.segments.segmenter.num_segments
         return TagAttentionState(
-            time_s=jnp.asarray(jnp.nan, jnp.float32),
+            time_s=jnp.asarray(jnp.nan, frame.time_s.dtype),
             segments=self.segments.init(camera),
             dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
             attention=self._no_attention(frame, num_segments),

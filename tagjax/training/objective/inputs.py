@@ -98,6 +98,9 @@ class _FadingTracer(AbstractTracer):
     def _fade(self, leaf: Array) -> Array:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             return leaf
+        # At the ends of the range a product would be 0 times infinity: states hold times that are minus infinity.
+        if self.memory in (0.0, 1.0):
+            return leaf if self.memory else jax.lax.stop_gradient(leaf)
         return self.memory * leaf + jax.lax.stop_gradient((1.0 - self.memory) * leaf)
 
     def finish(self, state: Any) -> Any:
