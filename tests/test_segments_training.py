@@ -93,7 +93,7 @@ def test_exactly_the_named_parameters_are_learned() -> None:
 @pytest.mark.parametrize("memory", [0.0, 0.5, 1.0])
 def test_training_traces_what_the_tracer_traces(clip, memory: float) -> None:
     settings = dataclasses.replace(OBJECTIVE, memory=memory)
-    wrapped = eqx.filter_jit(lambda *args: objective_inputs(*args, settings).trace)
+    wrapped = eqx.filter_jit(lambda one, camera, frames: objective_inputs(one, camera, frames, settings).trace)
     found, expected = (f(_tracer(), clip.camera, clip.frames) for f in (wrapped, eqx.filter_jit(trace)))
     # Programs that are compiled apart round otherwise; what is lost or not a number shows as a mask of another object.
     np.testing.assert_allclose(found.mask, expected.mask, atol=1e-3)
