@@ -62,9 +62,9 @@ def last() -> LiveFrame:
 
 def _same(found: LiveFrame, last: LiveFrame) -> None:
     order = jnp.array([found.places[epc] for epc in last.places])
-    assert bool(jnp.all(last.trace.detected))
+    assert bool(jnp.all(last.trace.tags.detected))
     np.testing.assert_allclose(found.trace.box_px[order], last.trace.box_px, atol=1e-3)
-    np.testing.assert_allclose(found.trace.confidence[order], last.trace.confidence, atol=1e-4)
+    np.testing.assert_allclose(found.trace.tags.confidence[order], last.trace.tags.confidence, atol=1e-4)
 
 
 def test_no_tag_is_no_detection():
@@ -72,7 +72,7 @@ def test_no_tag_is_no_detection():
     found = [_process(live, number, reads=TagReads.empty()) for number in range(4)][-1]
     assert found.places == {}
     assert _finite(found.trace)
-    assert not bool(jnp.any(found.trace.detected))
+    assert not bool(jnp.any(found.trace.tags.detected))
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0])
@@ -83,7 +83,7 @@ def test_depth_that_is_always_missing_is_no_detection(value):
     assert all(_finite(found.trace) for found in all_found)
     found = all_found[-1]
     assert set(found.places) == {"tag-a", "tag-b"}
-    assert not bool(jnp.any(found.trace.detected))
+    assert not bool(jnp.any(found.trace.tags.detected))
     assert bool(jnp.all(found.trace.labels == -1))
 
 
@@ -138,8 +138,8 @@ def test_a_gap_of_30_seconds_is_survived():
     live, gap_ns = _live(), 30 * 10**9
     found = [_process(live, number, later_ns=gap_ns if number >= 20 else 0) for number in range(40)]
     assert all(_finite(one.trace) for one in found)
-    assert bool(jnp.all(found[19].trace.detected))
-    assert bool(jnp.all(found[39].trace.detected))
+    assert bool(jnp.all(found[19].trace.tags.detected))
+    assert bool(jnp.all(found[39].trace.tags.detected))
 
 
 def test_times_of_days_later_are_rebased_at_once():
@@ -162,7 +162,7 @@ def test_more_than_64_tags_are_all_traced():
     _process(live, 2)
     found = _process(live, 3, reads=_many(3, 70))
     assert {"tag-a", "tag-b", *(f"tag-{place}" for place in range(70))} == set(found.places)
-    assert found.trace.confidence.shape == (128,)
+    assert found.trace.tags.confidence.shape == (128,)
     assert found.num_dropped == found.num_unused == 0
 
 

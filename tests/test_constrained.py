@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tagjax.core.build import build
-from tagjax.core.constrained import Fraction, Positive, named_values, with_named_values
+from tagjax.core.constrained import Fraction, Negative, Positive, named_values, static_settings, with_named_values
 from tagjax.core.settings import ConfigError
 
 
@@ -18,6 +18,17 @@ def test_a_positive_value_comes_back(value):
     parameter = Positive(value)
     assert parameter.unconstrained.dtype == jnp.float32
     assert float(parameter.value) == pytest.approx(value, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [-1e-30, -0.0374, -4.0])
+def test_a_negative_value_comes_back(value):
+    assert float(Negative(value).value) == pytest.approx(value, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -1e-60, -1e60, float("nan"), -float("inf")])
+def test_values_that_are_not_negative_are_refused(value):
+    with pytest.raises(ValueError, match="expected"):
+        Negative(value)
 
 
 @pytest.mark.parametrize("value", [1e-9, 0.04, 0.5, 0.999])
@@ -83,6 +94,8 @@ def test_values_have_dotted_names_and_come_back():
     assert named_values(changed)["inner.offset"] == 3.0
     assert jax.tree.structure(changed) == jax.tree.structure(outer)
     assert named_values(Outer()) == {"part": 0.5}  # a stage that is off has no parameters
+    assert static_settings(outer) == {"inner.steps": 3}
+    assert static_settings(Outer()) == {"inner": None}
 
 
 @pytest.mark.parametrize(

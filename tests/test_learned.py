@@ -69,7 +69,12 @@ def test_settings_that_learned_parameters_replace_are_refused(tmp_path: Path) ->
     tracer = TagAttention(cell=4)
     with pytest.raises(ValueError, match=r"found tracer\.beta=0\.5; expected 0\.8"):
         load_parameters(tracer, path, {**SETTINGS, "beta": 0.5})
-    load_parameters(tracer, path, {**SETTINGS, "cell": 9, "max_speed_m_s": 2.0})  # which are not learned
+    other = {**SETTINGS, "cell": 9, "max_speed_m_s": 2.0}  # which are not learned
+    with pytest.raises(
+        ValueError, match=r"found tracer\.cell=9, .*; expected tracer\.cell=4, .*Set the expected values"
+    ):
+        load_parameters(tracer, path, other)
+    load_parameters(tracer, _changed(path, version=3), other)  # whose files held none of them
 
 
 def _changed(path: Path, **changes: Any) -> Path:

@@ -11,7 +11,7 @@ import math
 import operator
 import reprlib
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -42,6 +42,26 @@ class Positive(eqx.Module):
         return jnp.exp(self.unconstrained)
 
 
+class Negative(eqx.Module):
+    """A negative value x, stored as log(-x): equal steps are equal ratios."""
+
+    unconstrained: Float[Array, "*shape"]
+
+    def __init__(self, value: float) -> None:
+        """Raises `ValueError` for a value that is not negative, or is 0 or infinite in float32."""
+        if not value < 0:
+            raise ValueError(
+                f"value is {value}; expected a negative value (it is stored as the logarithm of its amount)."
+            )
+        check_positive(amount=-value)
+        self.unconstrained = jnp.asarray(math.log(-value), jnp.float32)
+
+    @property
+    def value(self) -> Float[Array, "*shape"]:
+        """The value, in the unit it was given in."""
+        return -jnp.exp(self.unconstrained)
+
+
 class Fraction(eqx.Module):
     """A fraction p strictly between 0 and 1, stored as log odds log(p / (1 - p))."""
 
@@ -62,9 +82,27 @@ class Fraction(eqx.Module):
         return jax.nn.sigmoid(self.unconstrained)
 
 
+Constrained = Positive | Negative | Fraction
+
+
 def named_values(module: eqx.Module) -> dict[str, float]:
     """The learnable scalars of a module and of the modules in it, in physical units, by dotted name (`body.rigid.noise_m`)."""
     return {name: _value(leaf) for name, leaf in _named(module).items()}
+
+
+def static_settings(module: eqx.Module) -> dict[str, Any]:
+    """The static fields of a module and of the modules in it by dotted name (`body.num_rounds`), tuples as lists.
+
+    A part that is off is None under its own name.
+    """
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name)
+        if field.metadata.get("static", False) or value is None:
+            found[field.name] = list(value) if isinstance(value, tuple) else value
+        elif isinstance(value, eqx.Module) and not isinstance(value, Constrained):
+            found |= {f"{field.name}.{name}": inner for name, inner in static_settings(value).items()}
+    return found
 
 
 def with_named_values(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
@@ -88,24 +126,24 @@ def with_named_values(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
     return eqx.tree_at(lambda m: [place(m) for place in places], module, replaced)
 
 
-def _named(module: eqx.Module) -> dict[str, Positive | Fraction | Array]:
+def _named(module: eqx.Module) -> dict[str, Constrained | Array]:
     """The learnable scalars by dotted name, in the order of the fields."""
-    found: dict[str, Positive | Fraction | Array] = {}
+    found: dict[str, Constrained | Array] = {}
     for field in dataclasses.fields(module):
         leaf = getattr(module, field.name)
-        if isinstance(leaf, Positive | Fraction) or (eqx.is_inexact_array(leaf) and leaf.ndim == 0):
+        if isinstance(leaf, Constrained) or (eqx.is_inexact_array(leaf) and leaf.ndim == 0):
             found[field.name] = leaf
         elif isinstance(leaf, eqx.Module):
             found |= {f"{field.name}.{name}": value for name, value in _named(leaf).items()}
     return found
 
 
-def _value(leaf: Positive | Fraction | Array) -> float:
-    return float(leaf.value if isinstance(leaf, Positive | Fraction) else leaf)
+def _value(leaf: Constrained | Array) -> float:
+    return float(leaf.value if isinstance(leaf, Constrained) else leaf)
 
 
-def _like(leaf: Positive | Fraction | Array, value: float) -> Positive | Fraction | Array:
-    if isinstance(leaf, Positive | Fraction):
+def _like(leaf: Constrained | Array, value: float) -> Constrained | Array:
+    if isinstance(leaf, Constrained):
         return type(leaf)(value)
     if not abs(value) <= _MAX_FLOAT32:
         raise ValueError(f"found {reprlib.repr(value)}; expected a value that is finite in float32.")

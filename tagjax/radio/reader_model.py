@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax.scipy.special import i0e
 from jaxtyping import Array, Bool, Float
 
-from ..core.constrained import Fraction, Positive
+from ..core.constrained import Fraction, Negative, Positive
 from ..core.numerics import cos_sin, safe_sqrt
 from .noise import FLOOR_RAD, INTERCEPT, SLOPE_PER_DBM, UNKNOWN_RSSI_DBM
 from .phase import distance_to_phase
@@ -37,7 +37,7 @@ class ReaderModel(eqx.Module):
     within a factor of 1.5.
     """
 
-    slope_per_dbm: Float[Array, "*shape"]  # d log10(thermal noise / rad) / d RSSI
+    slope_per_dbm: Negative  # d log10(thermal noise / rad) / d RSSI
     intercept: Float[Array, "*shape"]  # log10(thermal noise / rad) at 0 dBm
     floor_rad: Positive  # thermal noise at a high RSSI
     spread_rad: Positive  # standard deviation beside thermal noise: reflections, errors of the motion
@@ -60,8 +60,9 @@ class ReaderModel(eqx.Module):
         outlier: float = 0.04,
         modulo_pi: bool = True,
     ) -> None:
-        """Raises `ValueError` for a spread, floor or drift that is not positive, or an outlier probability of 0 or 1."""
-        self.slope_per_dbm = jnp.asarray(slope_per_dbm, jnp.float32)
+        """Raises `ValueError` for a spread, floor or drift that is not positive, a slope that is not negative, or an outlier
+        probability of 0 or 1."""
+        self.slope_per_dbm = Negative(slope_per_dbm)
         self.intercept = jnp.asarray(intercept, jnp.float32)
         self.floor_rad = Positive(floor_rad)
         self.spread_rad = Positive(spread_rad)
@@ -78,7 +79,7 @@ class ReaderModel(eqx.Module):
     def thermal_rad(self, rssi_dbm: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Standard deviation of thermal phase noise; of a read without RSSI (NaN) that at `UNKNOWN_RSSI_DBM`."""
         rssi = jnp.where(jnp.isfinite(rssi_dbm), rssi_dbm, UNKNOWN_RSSI_DBM)
-        by_rssi = jnp.exp(jnp.log(10.0) * (self.slope_per_dbm * rssi + self.intercept))
+        by_rssi = jnp.exp(jnp.log(10.0) * (self.slope_per_dbm.value * rssi + self.intercept))
         return jnp.sqrt(jnp.square(self.floor_rad.value) + jnp.square(by_rssi))
 
     def concentration(self, rssi_dbm: Float[Array, "*#batch"], still: Bool[Array, "*#batch"]) -> Float[Array, "*batch"]:

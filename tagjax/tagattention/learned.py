@@ -1,33 +1,52 @@
 """Learned tracer parameters as plain numbers: one JSON file with the tracer's settings, the clip settings and the recipe.
 
 Nothing in a file is executed: it names numbers, which take the place of parameters that the tracer has already, and the
-clip settings of the training, with which the tracer is evaluated unless others are given. A checksum shows damage.
+clip settings of the training, with which the tracer is evaluated unless others are given. Parameters and static settings
+have their dotted names (`body.rigid.noise_m`). A checksum shows damage.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import json
 import reprlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
+import equinox as eqx
+
+from ..core.build import build
+from ..core.constrained import static_settings
 from ..core.files import write_atomic
 from ..core.json_text import json_checksum, not_float32, parse_json
-from . import TagAttention
+from ._differences import differences, flat, same, shown
 
 PACKAGED = Path(__file__).parent / "weights"
 """Where the parameters that come with the package lie, as <name>.json."""
 
 _FORMAT = "tagjax-tracer-parameters"
-_VERSION = 3
+_VERSION = 4
+_OLDER = (3,)
+"""Versions that are read as well: files of version 3 hold no static settings, which are then not compared."""
+
 _MAX_BYTES = 1_000_000
 _CHECKSUM = "sha256"
 
 CLIP_NAMES = ("stride", "window", "flow", "estimator", "antennas")
 """Clip settings that change a tracer's results; `max_reads` and `length` are sizes of buffers."""
+
+
+@runtime_checkable
+class LearnableTracer(Protocol):
+    """A tracer (a Module) whose parameters have names, and values in physical units."""
+
+    def physical(self) -> dict[str, float]: ...
+
+    def with_physical(self, values: Mapping[str, float]) -> Any: ...
+
+
+TracerT = TypeVar("TracerT", bound=LearnableTracer)
 
 
 def packaged_parameters() -> tuple[str, ...]:
@@ -41,19 +60,19 @@ class Learned:
 
     path: Path
     settings: Mapping[str, Any]  # of the tracer, with the values that learning began from
+    static: Mapping[str, Any] | None  # settings that are not learned, by dotted name; None: of an older version
     clips: Mapping[str, Any]  # clip settings of the training: stride, window, flow, estimator, antennas
-    parameters: Mapping[str, float]  # in physical units
+    parameters: Mapping[str, float]  # in physical units, by dotted name
     default: bool  # whether `default` may mean this file
 
-    def unmoved(self) -> set[str]:
+    def unmoved(self, began: Mapping[str, Any]) -> set[str]:
         """Parameters that still have the value that learning began from."""
-        began = self.settings
-        return {name for name, value in self.parameters.items() if name in began and value == began[name]}
+        return {name for name, value in self.parameters.items() if name in began and same(value, began[name])}
 
 
 def save_parameters(
     path: str | Path,
-    tracer: TagAttention,
+    tracer: LearnableTracer,
     settings: Mapping[str, Any],
     clips: Mapping[str, Any],
     about: Mapping[str, Any] | None = None,
@@ -72,6 +91,7 @@ def save_parameters(
         "format": _FORMAT,
         "version": _VERSION,
         "settings": _parameters_only(settings),
+        "static": _static(tracer),
         "clips": chosen,
         "parameters": tracer.physical(),
         "about": dict(about or {}),
@@ -108,38 +128,78 @@ def read_learned(source: str | Path, settings: Mapping[str, Any] | None = None) 
     return _default_for(settings) if str(source) == "default" else _read(_find(source))
 
 
-def load_parameters(tracer: TagAttention, source: str | Path, settings: Mapping[str, Any]) -> TagAttention:
+def load_parameters(tracer: TracerT, source: str | Path, settings: Mapping[str, Any]) -> TracerT:
     """The tracer with learned parameters in place of its own; `source` and errors as of `read_learned`.
 
-    Raises `ValueError` also for parameters of another tracer, and where `settings` ask for other initial values than the
+    `settings` are those that the tracer was built with. Raises `ValueError` also for parameters of another tracer, for
+    other static settings than the file's (floats may differ by 1e-5 of their value), and for other initial values than the
     learning began from. A parameter that learning left unchanged may have any value.
     """
     found = read_learned(source, settings)
-    learned, unmoved = dict(found.parameters), found.unmoved()
-    for name, default in _learnable(tracer).items():
-        began, asked = (given.get(name, default) for given in (found.settings, settings))
-        if asked != began and name in unmoved:
-            learned[name] = asked
-        elif asked != began:
+    _check_target(found, settings)
+    wanted = _built(tracer, settings)
+    if found.static is not None:
+        _check_static(found.path, _static(wanted), found.static)
+    began = _began(tracer, found)
+    learned, unmoved = dict(found.parameters), found.unmoved(began)
+    for name, asked in wanted.physical().items():
+        if name not in began or same(asked, began[name]):
+            continue
+        if name not in unmoved:
             raise ValueError(
-                f"{found.path}: found tracer.{name}={asked!r}; expected {began!r}, from which these parameters were learned: "
-                f"the learned value would replace yours. Leave out {name}, or weights=."
+                f"{found.path}: found tracer.{name}={shown(asked)}; expected {shown(began[name])}, from which these "
+                f"parameters were learned: the learned value would replace yours. Leave out {name}, or weights=."
             )
+        learned[name] = asked
     try:
         return tracer.with_physical(learned)
     except ValueError as error:
-        raise ValueError(f"{found.path}: {error}") from error
+        raise ValueError(f"{found.path}: {error} Use the tracer that these parameters were learned with.") from error
+
+
+def _check_target(found: Learned, settings: Mapping[str, Any]) -> None:
+    learned, asked = found.settings.get("_target_"), settings.get("_target_")
+    if learned != asked:
+        raise ValueError(
+            f"{found.path}: found parameters of the tracer {str(learned)[:100]}; expected those of {asked}. Choose the "
+            "tracer that they were learned with (tracer=), or other weights (weights=)."
+        )
+
+
+def _check_static(path: Path, asked: Mapping[str, Any], learned: Mapping[str, Any]) -> None:
+    if apart := differences(asked, learned):
+        some = list(apart.items())[:3]
+        found, expected = (", ".join(f"tracer.{name}={both[side]}" for name, both in some) for side in (0, 1))
+        more = f" ({len(apart) - 3} further settings differ)" if len(apart) > 3 else ""
+        raise ValueError(
+            f"{path}: found {found}; expected {expected}, with which these parameters were learned{more}. Set the expected "
+            "values, or leave out weights= and train again."
+        )
+
+
+def _built(tracer: TracerT, settings: Mapping[str, Any]) -> TracerT:
+    """A tracer of the same class from other settings. Raises `ConfigError` for settings that it does not take."""
+    return build(_parameters_only(settings), {str(settings.get("_target_")): type(tracer)}, where="tracer")
+
+
+def _began(tracer: LearnableTracer, found: Learned) -> dict[str, float]:
+    """The values that learning began from, by the names of parameters."""
+    try:
+        return _built(tracer, found.settings).physical()
+    except ValueError as error:
+        raise ValueError(
+            f"{found.path}: found settings that the tracer does not take ({str(error)[:300]}); expected those of its training. "
+            "Copy the file again, or train again."
+        ) from error
+
+
+def _static(tracer: LearnableTracer) -> dict[str, Any]:
+    assert isinstance(tracer, eqx.Module)
+    return static_settings(tracer)
 
 
 def _parameters_only(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name != "clips"}
-
-
-def _learnable(tracer: TagAttention) -> dict[str, Any]:
-    """The arguments of a tracer that are learned, with their defaults."""
-    static = {field.name for field in dataclasses.fields(tracer) if field.metadata.get("static", False)}
-    arguments = inspect.signature(type(tracer)).parameters.values()
-    return {argument.name: argument.default for argument in arguments if argument.name not in static}
 
 
 def _find(source: str | Path) -> Path:
@@ -159,12 +219,8 @@ def _default_for(settings: Mapping[str, Any] | None) -> Learned:
     for one in found:
         if settings is None:
             return one
-        unmoved = one.unmoved()
-        began, asked = (
-            {name: value for name, value in each.items() if name not in unmoved}
-            for each in (one.settings, _parameters_only(settings))
-        )
-        if began == asked:
+        began, asked = flat(one.settings), flat(_parameters_only(settings))
+        if differences(asked, began).keys() <= one.unmoved(began):
             return one
     there = ", ".join(packaged_parameters()) or "none"
     raise ValueError(
@@ -175,9 +231,9 @@ def _default_for(settings: Mapping[str, Any] | None) -> Learned:
 
 def _read(path: Path) -> Learned:
     content = _content(path)
-    parts = [content.get(name) for name in ("settings", "clips", "parameters")]
-    if not all(isinstance(part, dict) for part in parts):
-        raise ValueError(f"{path}: no settings, clips or parameters found; expected all three. Copy the file again.")
+    needed = ["settings", "clips", "parameters", *(["static"] if content["version"] == _VERSION else [])]
+    if lacking := [name for name in needed if not isinstance(content.get(name), dict)]:
+        raise ValueError(f"{path}: found no {', '.join(lacking)}; expected {', '.join(needed)}. Copy the file again.")
     wrong = [name for name, value in content["parameters"].items() if not _is_number(value)]
     if wrong:
         raise ValueError(f"{path}: {', '.join(wrong)}: not a number; expected one. Train again.")
@@ -198,7 +254,8 @@ def _read(path: Path) -> Learned:
     if isinstance(flow := clips.get("flow"), str) and _is_file(path.parent / flow):
         clips["flow"] = str(path.parent / flow)
     parameters = {name: float(value) for name, value in content["parameters"].items()}
-    return Learned(path, content["settings"], clips, parameters, default)
+    static = content["static"] if content["version"] == _VERSION else None
+    return Learned(path, content["settings"], static, clips, parameters, default)
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -214,9 +271,10 @@ def _content(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise ValueError(f"{path}: found JSON, but no learned parameters; expected the format {_FORMAT}.")
-    if content.get("version") != _VERSION:
+    if content.get("version") not in (_VERSION, *_OLDER):
+        readable = " and ".join(str(version) for version in (*_OLDER, _VERSION))
         raise ValueError(
-            f"{path}: version {reprlib.repr(content.get('version'))}; this release reads {_VERSION}. Train again."
+            f"{path}: version {reprlib.repr(content.get('version'))}; this release reads {readable}. Train again."
         )
     return content
 

@@ -15,7 +15,7 @@ from ..core.settings import changed
 from ..tracing.clips import ClipSettings
 from ..tracing.tracer import AbstractTracer
 from . import TagAttention
-from .learned import load_parameters, read_learned
+from .learned import LearnableTracer, load_parameters, read_learned
 from .literal import TagAttentionLiteral
 from .published import TagAttentionPublished
 from .segments import TagAttention as SegmentTagAttention
@@ -35,10 +35,10 @@ def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> Abst
     Raises `ConfigError` if the settings describe something else, `ValueError` for weights of a tracer that has none.
     """
     parameters = {name: value for name, value in settings.items() if name != "clips"}
-    tracer = build(parameters, TRACERS, where="tracer")
+    tracer: AbstractTracer = build(parameters, TRACERS, where="tracer")
     if weights is None:
         return tracer
-    if not isinstance(tracer, TagAttention):
+    if not isinstance(tracer, LearnableTracer):
         raise ValueError(
             f"weights={weights}: found the tracer {settings['_target_']}; learned parameters are of TagAttention. Leave out "
             "weights=, or choose another tracer."

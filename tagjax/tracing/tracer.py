@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ..core.numerics import safe_norm
@@ -16,6 +17,17 @@ from ..radio.reads import PhaseReads, RadioWindow
 
 MAX_OBJECTS = 32
 """Objects that a frame can give, numbered from 1; each is a segment in place of the tracer's own."""
+
+
+STORED = "stored"
+"""Name of the values of a step that training stores for the backward pass; it computes all others again."""
+
+TreeT = TypeVar("TreeT")
+
+
+def stored(values: TreeT) -> TreeT:
+    """The values themselves, which are small but costly, marked as `STORED`."""
+    return checkpoint_name(values, STORED)
 
 
 class Camera(eqx.Module):

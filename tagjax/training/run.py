@@ -18,8 +18,7 @@ from ..core.interruption import interruption
 from ..core.results import to_json_values, write_json
 from ..recording import Recording
 from ..report.report import score_table
-from ..tagattention import TagAttention
-from ..tagattention.learned import save_parameters
+from ..tagattention.learned import LearnableTracer, save_parameters
 from ..tagattention.tracer_settings import baseline_clips, make_tracer
 from ..tracing.clips import Clip, clip_loader
 from ..tracing.tracer import AbstractTracer
@@ -168,6 +167,11 @@ def _train(
             console.print(f"Resumed at step {int(state.step)} of {config.loop.num_steps}.")
         logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=int(state.step))
 
+        def update(state: TrainState, clips: Sequence[Clip]) -> tuple[TrainState, dict[str, float]]:
+            state, numbers = train_step(state, clips, optimizer, config.objective)
+            values = {f"parameter/{name}": value for name, value in parameters(state.tracer).items()}
+            return state, numbers | values
+
         def validate(state: TrainState) -> dict[str, float]:
             return validation_metrics(state, clips_held_out, config)
 
@@ -175,7 +179,7 @@ def _train(
             trained = train(
                 state,
                 source,
-                update=lambda state, clips: train_step(state, clips, optimizer, config.objective),
+                update=update,
                 settings=config.loop,
                 logger=logger,
                 checkpoints=checkpoints,
@@ -204,11 +208,11 @@ def _save_learned(
     flows = {name: evaluation_flow(model, config, files[name]) for name, model in models.items()}
     tracers = {name: model.tracer if isinstance(model, JointModel) else model for name, model in models.items()}
     tracers |= {name: make_tracer(settings) for name, settings in config.baselines.items()}
-    if isinstance(tracers["learned"], TagAttention):
+    if isinstance(learned := tracers["learned"], LearnableTracer):
         recipe = dataclasses.asdict(config) | {"steps": int(state.step)}
         clips = dataclasses.asdict(config.data.clips) | {"flow": flows["learned"]}
         about = to_json_values({"recipe": recipe})
-        save_parameters(folder / "weights.json", tracers["learned"], config.tracer, to_json_values(clips), about)
+        save_parameters(folder / "weights.json", learned, config.tracer, to_json_values(clips), about)
     write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
     return tracers, flows
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ...core.numerics import safe_divide, safe_norm
@@ -18,10 +17,6 @@ from ...core.parameters import check_positive
 _MAX_COUNT = 100.0  # frames in a candidate's running mean
 _REVEAL_FRAMES = 1.5  # a single frame's wrong depth reveals nothing
 _NEARER_FACTOR = 10.0  # a nearer surface is more often a resting person than a new wall
-
-
-def _scalar(value: float | Array) -> Float[Array, ""]:
-    return jnp.asarray(value, jnp.float32)
 
 
 class BackgroundState(eqx.Module):
@@ -54,7 +49,7 @@ class BackgroundView(eqx.Module):
 
 
 class Background(eqx.Module):
-    """Settings of the background model.
+    """Settings of the background model. They are static: only comparisons use them, and no gradient reaches them.
 
     Good values: `confirm_s` 1.5 (shorter confirms a person who pauses, longer lets shadows move for longer), `early_s` 0.3
     (age from which an unlabelled pixel counts as static), `still_m_s` 0.03 (apparent motion of a point, flow * z / focal),
@@ -63,15 +58,15 @@ class Background(eqx.Module):
     Raises `ValueError` for a value that is not positive.
     """
 
-    confirm_s: Float[Array, ""] = eqx.field(converter=_scalar, default=1.5)
-    early_s: Float[Array, ""] = eqx.field(converter=_scalar, default=0.3)
-    still_m_s: Float[Array, ""] = eqx.field(converter=_scalar, default=0.03)
-    tolerance_m: Float[Array, ""] = eqx.field(converter=_scalar, default=0.004)
-    tolerance_m_m2: Float[Array, ""] = eqx.field(converter=_scalar, default=0.004)
-    reveal_s: Float[Array, ""] = eqx.field(converter=_scalar, default=0.08)
+    confirm_s: float = eqx.field(static=True, default=1.5)
+    early_s: float = eqx.field(static=True, default=0.3)
+    still_m_s: float = eqx.field(static=True, default=0.03)
+    tolerance_m: float = eqx.field(static=True, default=0.004)
+    tolerance_m_m2: float = eqx.field(static=True, default=0.004)
+    reveal_s: float = eqx.field(static=True, default=0.08)
 
     def __check_init__(self) -> None:
-        check_positive(**{name: float(leaf) for name, leaf in vars(self).items() if not isinstance(leaf, Tracer)})
+        check_positive(**vars(self))
 
     def init(self, height: int, width: int) -> BackgroundState:
         """Nothing seen."""

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ...core.constrained import Fraction, Positive
+from ...core.constrained import Positive
 from ...radio.arrivals import Arrivals
 
 
@@ -29,7 +29,7 @@ class Detection(eqx.Module):
     stationary: Float[Array, ""]  # prior log odds of a stationary tag against one on its body
     elsewhere: Float[Array, ""]  # prior log odds of a tag that is elsewhere; low: reflections change phases that fit
     fresh_s: Positive  # time constant of the reads' age
-    threshold: Fraction  # confidence above which a tag is detected
+    threshold: float = eqx.field(static=True)  # confidence above which a tag is detected; no gradient reaches it
 
     def __init__(
         self,
@@ -43,7 +43,9 @@ class Detection(eqx.Module):
         """Raises `ValueError` for a time or temperature that is not positive, or a threshold that is not between 0 and 1."""
         self.temperature_nats, self.fresh_s = Positive(temperature_nats), Positive(fresh_s)
         self.stationary, self.elsewhere = (jnp.asarray(odds, jnp.float32) for odds in (stationary, elsewhere))
-        self.threshold = Fraction(threshold)
+        if not 0.0 < threshold < 1.0:
+            raise ValueError(f"threshold is {threshold}; expected a confidence strictly between 0 and 1.")
+        self.threshold = float(threshold)
 
     def received(
         self,
@@ -72,4 +74,4 @@ class Detection(eqx.Module):
 
     def detected(self, confidence: Float[Array, " tag"]) -> Bool[Array, " tag"]:
         """Whether the confidence exceeds the threshold."""
-        return confidence > self.threshold.value
+        return confidence > self.threshold

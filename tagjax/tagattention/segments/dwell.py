@@ -22,6 +22,7 @@ from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
 
 _SHORTEST_FRAME_S = 1e-6
+_CHUNK = 16  # reads; a frame of 30 a second has 4 to 20 of them
 
 _Rows = tuple[Array, Array, Array]
 
@@ -122,14 +123,27 @@ class DwellEvidence(eqx.Module):
                 jax.lax.dynamic_update_index_in_dim(log_likelihood, own, read.tag, 0),
             ), None
 
+        def add_some(carry: tuple[_Rows, Array, Array], some: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
+            """Reads that are all padding cost one step, not one each: their gradients would take longer than the reads'."""
+            return jax.lax.cond(
+                jnp.any(some[0].valid), lambda now: jax.lax.scan(add, now, some)[0], lambda now: now, carry
+            ), None
+
         num_antennas, shape = increment_m.shape[0], state.real.shape
         tables = tuple(table.reshape(-1, shape[-1]) for table in (state.real, state.imaginary, state.read_m))
         carry = (tables, state.channel.reshape(-1), decay * state.log_likelihood)
-        (tables, channel, log_likelihood), _ = jax.lax.scan(add, carry, (arrivals, fraction, fresh))
+        reads = jax.tree.map(_in_chunks, (arrivals, fraction, fresh))
+        (tables, channel, log_likelihood), _ = jax.lax.scan(add_some, carry, reads)
         real, imaginary, read_m = (table.reshape(shape) for table in tables)
         distance_m = last_m + increment_m
         after = DwellState(real, imaginary, read_m, distance_m, channel.reshape(shape[:2]), log_likelihood)
         return after, log_likelihood
+
+
+def _in_chunks(values: Array) -> Array:
+    """Values of reads as (chunk, read), padded with zeros, which are no valid reads."""
+    padded = jnp.pad(values, (0, -values.shape[0] % _CHUNK))
+    return padded.reshape(-1, _CHUNK)
 
 
 def _inherit(state: DwellState, newborn_source: Int[Array, " segment"]) -> DwellState:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...tracing.tracer import Camera
+from ...tracing.tracer import Camera, stored
 from .background import Background, BackgroundState, BackgroundView
 from .carry import on_surface
 from .cells import NO_LABEL, NOT_NEW
@@ -79,8 +79,9 @@ class SegmentTracker(eqx.Module):
         segments, found = self.segmenter.step(
             state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal
         )
+        labels, counted = stored((segments.labels, found.counted))
         motion = segment_motion(
-            camera, segments.labels, found.counted, depth_m, state.segments.depth_m, backward_px,
+            camera, labels, counted, depth_m, state.segments.depth_m, backward_px,
             self.segmenter.max_change_m(dt_s), self.segmenter.num_segments, self.segmenter.min_measured,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
@@ -101,7 +102,7 @@ class SegmentTracker(eqx.Module):
             num_unplaced=found.num_unplaced,
             background_lost=jax.lax.stop_gradient(view.lost),
         )
-        return SegmentTrackerState(background, kept), frame
+        return SegmentTrackerState(background, kept), stored(frame)
 
 
 def focal_px(camera: Camera) -> Float[Array, ""]:

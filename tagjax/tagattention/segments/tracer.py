@@ -136,7 +136,7 @@ class TagAttention(AbstractTracer):
         if self.attention is not None:
             attention = AttentionState.nothing(num_tags, num_antennas, num_segments, num_window, time_s)
         return TagState(
-            time_s=jnp.asarray(jnp.nan, jnp.float32),
+            time_s=jnp.full_like(time_s, jnp.nan),
             travel=None if self.travel is None else self.travel.init(num_segments),
             dwell=dwell,
             attention=attention,

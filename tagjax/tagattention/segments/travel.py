@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Positive
 from ...core.numerics import safe_norm
+from ...core.parameters import check_positive
 from .past_motion import PastMotion
 from .step import SegmentFrame
 
@@ -50,12 +51,12 @@ class TravellingTogether(eqx.Module):
     noise_m: Positive  # displacements that differ by this are the same
     noise_fraction: Positive  # ... by this fraction of the displacement
     travel_per_m: Positive  # ... by this times the displacement squared
-    adopt_m: Positive  # a segment from nowhere goes on from a mover within this distance
-    mover_m_s: Positive  # speed of such a mover
     heal_s: Positive  # evidence is pooled as well, with this time constant
     num_active: int = eqx.field(static=True)
     num_newborn: int = eqx.field(static=True)  # segments from nowhere that are looked at, the largest
     lag_s: float = eqx.field(static=True)
+    adopt_m: float = eqx.field(static=True)  # a segment from nowhere goes on from a mover within this distance
+    mover_m_s: float = eqx.field(static=True)  # speed of such a mover
 
     def __init__(
         self,
@@ -75,16 +76,14 @@ class TravellingTogether(eqx.Module):
         for name, count in (("num_active", num_active), ("num_newborn", num_newborn)):
             if count < 1:
                 raise ValueError(f"{name} is {count}; expected at least 1.")
-        if not lag_s > 0:
-            raise ValueError(f"lag_s is {lag_s}; expected a positive time.")
+        check_positive(lag_s=lag_s, adopt_m=adopt_m, mover_m_s=mover_m_s)
         self.reach_m = Positive(reach_m)
         self.noise_m = Positive(noise_m)
         self.noise_fraction = Positive(noise_fraction)
         self.travel_per_m = Positive(travel_per_m)
-        self.adopt_m = Positive(adopt_m)
-        self.mover_m_s = Positive(mover_m_s)
         self.heal_s = Positive(heal_s)
-        self.num_active, self.num_newborn, self.lag_s = num_active, num_newborn, float(lag_s)
+        self.num_active, self.num_newborn = num_active, num_newborn
+        self.lag_s, self.adopt_m, self.mover_m_s = float(lag_s), float(adopt_m), float(mover_m_s)
 
     def init(self, num_segments: int) -> TravelState:
         """The state before the first frame."""
@@ -143,13 +142,13 @@ class TravellingTogether(eqx.Module):
         return after, found, Pooling(active, pooled, weight)
 
     def heal(
-        self, travel: Pooling, log_likelihood: Float[Array, "tag segment"], dt_s: Float[Array, ""]
+        self, pooling: Pooling, log_likelihood: Float[Array, "tag segment"], dt_s: Float[Array, ""]
     ) -> Float[Array, "tag segment"]:
         """Evidence drawn to that of what travels together, so that a new segment's wrong inheritance does not last."""
         part = 1.0 - jnp.exp(-dt_s / self.heal_s.value)
-        own = log_likelihood[:, travel.active]
-        pooled = own + part * (own @ travel.weight.T - own)
-        return log_likelihood.at[:, travel.active].set(jnp.where(travel.pooled[None], pooled, own))
+        own = log_likelihood[:, pooling.active]
+        healed = own + part * (own @ pooling.weight.T - own)
+        return log_likelihood.at[:, pooling.active].set(jnp.where(pooling.pooled[None], healed, own))
 
     def _kernel(
         self, centre_m: Float[Array, "active 3"], lagged_m: Float[Array, "active 3"]
@@ -179,9 +178,9 @@ class TravellingTogether(eqx.Module):
         lost = jnp.where(newborn & (source <= 0), area, 0.0)
         size, at = jax.lax.top_k(jax.lax.stop_gradient(lost), min(self.num_newborn, lost.shape[0]))
         apart = _squared_distance(centre_m[at], centre_m[active])
-        mover = there & ~newborn[active] & (speed_m_s[active] > self.mover_m_s.value)
+        mover = there & ~newborn[active] & (speed_m_s[active] > self.mover_m_s)
         apart = jnp.where(mover[None], apart, jnp.inf)
-        found = (size > 0) & (jnp.min(apart, axis=1) < jnp.square(self.adopt_m.value))
+        found = (size > 0) & (jnp.min(apart, axis=1) < self.adopt_m**2)
         nearest = active[jnp.argmin(apart, axis=1)].astype(source.dtype)
         return source.at[at].set(jnp.where(found, nearest, source[at]))
 

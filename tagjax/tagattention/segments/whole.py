@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Fraction, Positive
 from ...core.numerics import safe_divide, safe_norm
+from ...core.parameters import check_positive
 from .step import SegmentFrame
 
 _ROUNDS = 6
@@ -25,8 +26,8 @@ class WholeBody(eqx.Module):
     """Stage that completes bodies that travel. `WholeBody()` has good values."""
 
     travel_m_s: Positive  # net displacement over `lag_s`, above which a segment travels
-    gap: Positive
     share: Fraction  # a body travels where so much of it does
+    gap: float = eqx.field(static=True)  # of the middles of segments that are connected, in their mean size
     lag_s: float = eqx.field(static=True)
     num_active: int = eqx.field(static=True)  # segments that are looked at: those that travel fastest
 
@@ -40,12 +41,11 @@ class WholeBody(eqx.Module):
         num_active: int = 256,
     ) -> None:
         """Raises `ValueError` for a value that is not positive, or a share that is not between 0 and 1."""
-        if not lag_s > 0:
-            raise ValueError(f"lag_s is {lag_s}; expected a positive time.")
+        check_positive(lag_s=lag_s, gap=gap)
         if num_active < 1:
             raise ValueError(f"num_active is {num_active}; expected at least 1.")
-        self.travel_m_s, self.gap, self.share = Positive(travel_m_s), Positive(gap), Fraction(share)
-        self.lag_s, self.num_active = float(lag_s), num_active
+        self.travel_m_s, self.share = Positive(travel_m_s), Fraction(share)
+        self.gap, self.lag_s, self.num_active = float(gap), float(lag_s), num_active
 
     def completed(
         self,
@@ -64,7 +64,7 @@ class WholeBody(eqx.Module):
         _, at = jax.lax.top_k(jax.lax.stop_gradient(speed_m_s), min(self.num_active, num_segments))
         limit_m_s = self.travel_m_s.value
         travels = jnp.where(exists[at], jax.nn.sigmoid((speed_m_s[at] - limit_m_s) / (0.2 * limit_m_s)), 0.0)
-        body = connected(found.centre_m[at], self.gap.value * found.size_m[at], travels > 0.5)
+        body = connected(found.centre_m[at], self.gap * found.size_m[at], travels > 0.5)
 
         def of_tag(own: Float[Array, " segment"]) -> Float[Array, " segment"]:
             weight = own * found.area

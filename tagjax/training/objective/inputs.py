@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from ...radio.reads import PhaseReads
-from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace, trace
+from ...tracing.tracer import STORED, AbstractTracer, Camera, Frame, Trace, trace
 
 TERM_NAMES = ("contrast", "coverage", "area", "compactness", "steadiness", "calibration")
 """Names of the objective's terms; the settings hold a weight of each name."""
@@ -90,11 +90,17 @@ class _FadingTracer(AbstractTracer):
         state = jax.tree.map(self._fade, state)
         if not self.rematerialise:
             return self.tracer.step(camera, state, frame)
-        return eqx.filter_checkpoint(lambda t, c, s, f: t.step(c, s, f))(self.tracer, camera, state, frame)
+        policy = jax.checkpoint_policies.save_only_these_names(STORED)
+        # In a scan nothing can be merged across the forward and the backward pass.
+        again = eqx.filter_checkpoint(lambda t, c, s, f: t.step(c, s, f), prevent_cse=False, policy=policy)
+        return again(self.tracer, camera, state, frame)
 
     def _fade(self, leaf: Array) -> Array:
         if not jnp.issubdtype(leaf.dtype, jnp.inexact):
             return leaf
+        # At the ends of the range a product would be 0 times infinity: states hold times that are minus infinity.
+        if self.memory in (0.0, 1.0):
+            return leaf if self.memory else jax.lax.stop_gradient(leaf)
         return self.memory * leaf + jax.lax.stop_gradient((1.0 - self.memory) * leaf)
 
     def finish(self, state: Any) -> Any:
