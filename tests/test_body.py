@@ -20,6 +20,10 @@ def cloud(seed: int, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return rng.uniform(-0.1, 0.1, (count, 3)) + np.array([0.3, -0.1, 2.0]), rng.uniform(0.1, 1.0, count)
 
 
+def f32(values) -> jax.Array:
+    return jnp.asarray(values, jnp.float32)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_the_fit_is_that_of_scipy(seed):
     rng = np.random.default_rng(seed + 100)
@@ -27,8 +31,8 @@ def test_the_fit_is_that_of_scipy(seed):
     turn = Rotation.from_rotvec(rng.normal(0, 0.6, 3))
     after = turn.apply(before) + rng.normal(0, 0.2, 3) + rng.normal(0, 0.004, before.shape)
     middles = [np.average(points, axis=0, weights=weight) for points in (before, after)]
-    expected, _ = Rotation.align_vectors(after - middles[1], before - middles[0], weights=weight)
-    rotation, shift_m = rigid_fit(*(jnp.asarray(x, jnp.float32) for x in (weight, before, after)), jnp.zeros(()))
+    expected = Rotation.align_vectors(after - middles[1], before - middles[0], weights=weight)[0]
+    rotation, shift_m = rigid_fit(f32(weight), f32(before), f32(after), jnp.zeros(()))
     np.testing.assert_allclose(rotation, expected.as_matrix(), atol=2e-4)
     np.testing.assert_allclose(shift_m, middles[1] - expected.as_matrix() @ middles[0], atol=1e-3)
 
@@ -37,7 +41,7 @@ def test_a_rigid_motion_is_found_exactly():
     before, weight = cloud(1)
     turn, shift_m = Rotation.from_euler("zyx", [0.4, -0.7, 0.2]), np.array([0.05, -0.1, 0.2])
     after = turn.apply(before) + shift_m
-    rotation, found_m = rigid_fit(*(jnp.asarray(x, jnp.float32) for x in (weight, before, after)), jnp.zeros(()))
+    rotation, found_m = rigid_fit(f32(weight), f32(before), f32(after), jnp.zeros(()))
     np.testing.assert_allclose(before @ np.asarray(rotation).T + np.asarray(found_m), after, atol=2e-5)
 
 
@@ -51,11 +55,11 @@ def test_where_no_axis_is_determined_no_turn_is_taken_about_it(points):
     else:
         weight[:] = 0
     after = before + 0.05
-    arguments = [jnp.asarray(x, jnp.float32) for x in (weight, before, after)]
-    rotation, shift_m = rigid_fit(*arguments, jnp.asarray(1e-4))
+    given = f32(weight), f32(before)
+    rotation, shift_m = rigid_fit(*given, f32(after), jnp.asarray(1e-4))
     np.testing.assert_allclose(rotation, np.eye(3), atol=1e-3)
     np.testing.assert_allclose(shift_m, 0.0 if points == "none" else 0.05, atol=3e-3)
-    gradient = jax.grad(lambda y: jnp.sum(jnp.stack(rigid_fit(*arguments[:2], y, jnp.asarray(1e-4))[:1])))(arguments[2])
+    gradient = jax.grad(lambda y: jnp.sum(rigid_fit(*given, y, jnp.asarray(1e-4))[0]))(f32(after))
     assert bool(jnp.all(jnp.isfinite(gradient)))
 
 
@@ -120,6 +124,7 @@ def test_a_lag_counts_only_for_segments_that_were_there():
 def test_past_motion_reaches_back_the_same_time_at_any_frame_rate(rate_hz):
     past = PastMotion.nothing(3, span_s=0.67)
     velocity = jnp.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    now_s, displacement = jnp.zeros(()), jnp.zeros((3, 3))
     for frame in range(int(2 * rate_hz)):
         now_s = jnp.asarray(frame / rate_hz)
         displacement = velocity * now_s

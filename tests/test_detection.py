@@ -44,7 +44,7 @@ def test_recent_reads_are_counted_for_their_tag():
 
 def test_a_tag_is_lost_without_reads_however_sure_it_was():
     detection, reads = Detection(), jnp.array([40.0])
-    sure = [jnp.array([500.0]), jnp.array([-500.0])]
+    sure = jnp.array([500.0]), jnp.array([-500.0])
     assert bool(detection.detected(detection.confidence(*sure, reads))[0])
     for frame in range(150):  # five seconds
         reads = detection.received(

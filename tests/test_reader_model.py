@@ -33,9 +33,8 @@ def test_the_concentration_is_the_inverse_of_the_variance(modulo_pi):
 def test_a_motion_turns_the_phasor_and_adds_its_variance():
     moved, phasor = np.array([0.0, 0.05, -0.2, 0.05]), np.array([5.0, 40.0, 40.0, 0.0]) * np.exp(0.3j)
     reader = ReaderModel(drift_m=0.003)
-    real, imaginary = reader.moved(
-        *(jnp.asarray(each, jnp.float32) for each in (phasor.real, phasor.imag, moved)), jnp.asarray(915e6)
-    )
+    real, imaginary, moved_m = (jnp.asarray(each, jnp.float32) for each in (phasor.real, phasor.imag, moved))
+    real, imaginary = reader.moved(real, imaginary, moved_m, jnp.asarray(915e6))
     wave = 2 * 4 * np.pi * 915e6 / 299_792_458.0
     turned = np.exp(1j * (0.3 + wave * moved))
     length = np.array([1 / (1 / 5 + 0.0), *(1 / (1 / 40 + wave**2 * 0.003 * np.abs(moved[1:3]))), 0.0])

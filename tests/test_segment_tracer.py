@@ -147,17 +147,18 @@ def test_live_is_the_same_tracer(clip, traced):
     live = LiveTracer(
         TRACER, one.intrinsics, one.antennas_m, flow=lambda a, b: np.zeros((*a.shape[:2], 2), np.float32), stride=1
     )
-    last = -1
+    last, out = -1, None
     for number in range(one.num_frames):
         now = int(one.time_ns[number])
         new = one.reads[(one.reads.time_ns > last) & (one.reads.time_ns <= now)]
         out = live.process(np.asarray(one.colour[number]), one.depth_metres(number), now, new)
         last = now
+    assert out is not None
     places = [out.places[epc] for epc in EPCS]
     np.testing.assert_allclose(out.trace.box_px[jnp.array(places)], traced.box_px[-1], atol=1e-3)
     np.testing.assert_allclose(out.trace.tags.confidence[jnp.array(places)], traced.confidence[-1], atol=1e-2)
     with pytest.raises(ValueError, match="expected a later time"):
-        live.process(np.asarray(one.colour[0]), one.depth_metres(0), last, new)
+        live.process(np.asarray(one.colour[0]), one.depth_metres(0), last, one.reads[:0])
 
 
 def test_the_configuration_is_the_default():

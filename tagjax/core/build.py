@@ -54,7 +54,8 @@ def with_modules(called: Callable[..., Any], settings: Mapping[str, Any], *, whe
     for name, value in parts.items():
         classes = [one for one in (hints.get(name), *typing.get_args(hints.get(name))) if _is_module(one)]
         if classes and isinstance(value, Mapping):
-            path, (module, *_) = f"{where}.{name}", classes
+            path, module = f"{where}.{name}", classes[0]
+            assert module is not None
             known = inspect.signature(module).parameters
             if unknown := sorted(set(value) - set(known)):
                 raise ConfigError(f"{path}: unknown key {', '.join(unknown)}; known keys are {', '.join(known)}.")
