@@ -17,13 +17,18 @@ from tagjax.tagattention.segments.dwell import DwellEvidence, DwellState
 C = 299_792_458.0
 FRAME_S = 1 / 30
 NUM_SEGMENTS = 20
+DEPTH_M = np.linspace(1.0, 4.0, NUM_SEGMENTS)
 NO_NEWBORN = jnp.full(NUM_SEGMENTS, -2, jnp.int32)
 NEVER_FORGOTTEN = DwellEvidence(memory_s=1e12)
 
 
 @jax.jit
 def _step(evidence, reader, state, arrivals, increment_m, newborn_source, since_s, now_s):
-    return evidence.step(reader, state, arrivals, increment_m, newborn_source, since_s, now_s)
+    return evidence.step(reader, state, arrivals, increment_m, _depth_m(increment_m), newborn_source, since_s, now_s)
+
+
+def _depth_m(increment_m):
+    return jnp.asarray(DEPTH_M, increment_m.dtype)
 
 
 def _log_i0(x):
@@ -55,7 +60,7 @@ class Twin:
                 self.phasor[tag, antenna], self.read[tag, antenna] = 0, at
                 self.channel[tag, antenna] = channel
             way = np.abs(at - self.read[tag, antenna])
-            variance = (m * wave) ** 2 * float(self.reader.drift_m.value) * way
+            variance = (m * wave) ** 2 * float(self.reader.drift_m.value) * DEPTH_M**2 * way
             before = self.phasor[tag, antenna] / (1 + np.abs(self.phasor[tag, antenna]) * variance)
             self.read[tag, antenna] = at
             spread = np.full(len(at), float(self.reader.spread_rad.value))
@@ -284,9 +289,9 @@ def test_jit_is_eager_and_vmap_is_a_loop():
     evidence, reader, state = DwellEvidence(), ReaderModel(), DwellState.nothing(3, 2, NUM_SEGMENTS)
     rest = jnp.asarray(source, jnp.int32), jnp.asarray(since), jnp.asarray(now)
     steps = jnp.stack([jnp.asarray(increment), -jnp.asarray(increment)])
-    eager = [evidence.step(reader, state, _arrivals(reads), step, *rest) for step in steps]
+    eager = [evidence.step(reader, state, _arrivals(reads), step, _depth_m(step), *rest) for step in steps]
     compiled = [_step(evidence, reader, state, _arrivals(reads), step, *rest) for step in steps]
-    mapped = jax.vmap(lambda step: evidence.step(reader, state, _arrivals(reads), step, *rest))(steps)
+    mapped = jax.vmap(lambda step: evidence.step(reader, state, _arrivals(reads), step, _depth_m(step), *rest))(steps)
     mapped = [jax.tree.map(lambda leaf, i=i: leaf[i], mapped) for i in range(2)]
     for other in (compiled, mapped):
         for ours, theirs in zip(jax.tree.leaves(eager), jax.tree.leaves(other), strict=True):
@@ -313,7 +318,7 @@ def test_gradients_are_those_of_finite_differences():
 
             def frame(state, each):
                 (reads, source, since, now), increment = each
-                return evidence.step(reader, state, reads, increment, source, since, now)
+                return evidence.step(reader, state, reads, increment, _depth_m(increment), source, since, now)
 
             found = jax.lax.scan(frame, DwellState.nothing(3, 2, NUM_SEGMENTS), (given, increments))[1]
             return jnp.sum(chosen * found)
@@ -340,7 +345,7 @@ def test_gradients_are_finite_from_nothing():
         def score(models, state, increment):
             evidence, reader = models
             after, found = evidence.step(
-                reader, state, arrivals, increment, NO_NEWBORN, jnp.asarray(0.0), jnp.asarray(0.0)
+                reader, state, arrivals, increment, _depth_m(increment), NO_NEWBORN, jnp.asarray(0.0), jnp.asarray(0.0)
             )
             return jnp.sum(found) + jnp.sum(after.real + after.imaginary) + jnp.sum(after.moved_m)
 

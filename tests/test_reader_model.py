@@ -34,10 +34,10 @@ def test_a_motion_turns_the_phasor_and_adds_its_variance():
     moved, phasor = np.array([0.0, 0.05, -0.2, 0.05]), np.array([5.0, 40.0, 40.0, 0.0]) * np.exp(0.3j)
     reader = ReaderModel(drift_m=0.003)
     real, imaginary, moved_m = (jnp.asarray(each, jnp.float32) for each in (phasor.real, phasor.imag, moved))
-    real, imaginary = reader.moved(real, imaginary, moved_m, jnp.asarray(915e6))
+    real, imaginary = reader.moved(real, imaginary, moved_m, jnp.asarray(2.0), jnp.asarray(915e6))
     wave = 2 * 4 * np.pi * 915e6 / 299_792_458.0
     turned = np.exp(1j * (0.3 + wave * moved))
-    length = np.array([1 / (1 / 5 + 0.0), *(1 / (1 / 40 + wave**2 * 0.003 * np.abs(moved[1:3]))), 0.0])
+    length = np.array([1 / (1 / 5 + 0.0), *(1 / (1 / 40 + wave**2 * 0.003 * 2.0**2 * np.abs(moved[1:3]))), 0.0])
     np.testing.assert_allclose(np.asarray(real) + 1j * np.asarray(imaginary), length * turned, atol=2e-5)
 
 
@@ -47,9 +47,9 @@ def test_the_length_after_a_motion_is_that_of_a_distribution_with_the_added_vari
     before, noise = np.exp(20 * (np.cos(angle) - 1)), np.exp(-0.5 * angle**2 / 0.04)
     both = np.real(np.fft.ifft(np.fft.fft(before) * np.fft.fft(np.fft.ifftshift(noise))))
     resultant = np.sum(both * np.cos(angle)) / np.sum(both)
-    moved = 0.04 / (0.003 * (8 * np.pi * 915e6 / 299_792_458.0) ** 2)
+    moved = 0.04 / (0.003 * 3.0**2 * (8 * np.pi * 915e6 / 299_792_458.0) ** 2)
     real, imaginary = ReaderModel(drift_m=0.003).moved(
-        jnp.asarray(20.0), jnp.asarray(0.0), jnp.asarray(moved, jnp.float32), jnp.asarray(915e6)
+        jnp.asarray(20.0), jnp.asarray(0.0), jnp.asarray(moved, jnp.float32), jnp.asarray(3.0), jnp.asarray(915e6)
     )
     length = np.hypot(float(real), float(imaginary))
     assert special.ive(1, length) / special.ive(0, length) == pytest.approx(resultant, abs=2e-3)

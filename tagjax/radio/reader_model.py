@@ -4,9 +4,9 @@ Within a dwell (the time that a reader stays on one carrier) a read has the phas
 tag's distance, wave = 4 pi f / c, and m is 2 where phases count modulo pi, else 1. What is known of the phase at the present
 distance is a von Mises distribution: its phasor P has the direction of the phase and the length of its concentration, 0 at
 the dwell's first read. A motion by x turns it, and makes it less sure by the variance of the motion's error, which grows
-with the way:
+with the way, and with the depth z as a camera's errors do (pixels are larger there, and depth noise is proportional to z^2):
 
-    P' = P exp(j m wave x) / (1 + |P| v) ,    v = (m wave)^2 drift |x| .
+    P' = P exp(j m wave x) / (1 + |P| v) ,    v = (m wave)^2 drift (z / 1 m)^2 |x| .
 
 A read phi of concentration w adds to it, and has the log likelihood ratio g to a phase at random; with outliers of
 probability q that is log((1 - q) exp(g) + q):
@@ -42,9 +42,7 @@ class ReaderModel(eqx.Module):
     floor_rad: Positive  # thermal noise at a high RSSI
     spread_rad: Positive  # standard deviation beside thermal noise: reflections, errors of the motion
     still_spread_rad: Positive  # the same of a tag that stays in place
-    drift_m: (
-        Positive  # variance of a motion's error, m^2, for each metre: reflections change, and motions are not exact
-    )
+    drift_m: Positive  # variance of a motion's error, m^2, for each metre of the way, 1 m from the camera
     outlier: Fraction  # probability of a read with any phase
     modulo_pi: bool = eqx.field(static=True)  # phases count modulo pi, so that pi flips do not matter
 
@@ -56,7 +54,7 @@ class ReaderModel(eqx.Module):
         floor_rad: float = FLOOR_RAD,
         spread_rad: float = 0.064,
         still_spread_rad: float = 0.03,
-        drift_m: float = 0.001,
+        drift_m: float = 0.00014,
         outlier: float = 0.04,
         modulo_pi: bool = True,
     ) -> None:
@@ -92,12 +90,17 @@ class ReaderModel(eqx.Module):
         real: Float[Array, "*batch"],
         imaginary: Float[Array, "*batch"],
         moved_m: Float[Array, "*batch"],
+        depth_m: Float[Array, "*#batch"],
         carrier_hz: Float[Array, "*#batch"],
     ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-        """The phasor after the tag has moved by `moved_m`: turned by the phase of that, and less sure by its error."""
+        """The phasor after the tag has moved by `moved_m` as seen by a camera at `depth_m` from it.
+
+        It is turned by the phase of that motion, and less sure by the motion's error.
+        """
         turn_rad = self.multiple * distance_to_phase(moved_m, carrier_hz)
         wave = self.multiple * distance_to_phase(jnp.ones_like(moved_m), carrier_hz)
-        variance = jnp.square(wave) * self.drift_m.value * safe_sqrt(jnp.square(moved_m))
+        error_m2 = self.drift_m.value * jnp.square(depth_m) * safe_sqrt(jnp.square(moved_m))
+        variance = jnp.square(wave) * error_m2
         size = safe_sqrt(jnp.square(real) + jnp.square(imaginary))
         kept = 1.0 / (1.0 + size * variance)
         cos, sin = cos_sin(turn_rad)

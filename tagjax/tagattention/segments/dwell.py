@@ -71,6 +71,7 @@ class DwellEvidence(eqx.Module):
         state: DwellState,
         arrivals: Arrivals,
         increment_m: Float[Array, "antenna segment"],
+        depth_m: Float[Array, " segment"],
         newborn_source: Int[Array, " segment"],
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
@@ -78,7 +79,7 @@ class DwellEvidence(eqx.Module):
         """The state after the frame at `now_s`, and the evidence in nats.
 
         `arrivals` are the reads in (since_s, now_s], in order of time; `increment_m` is what each segment's distance to
-        each antenna has grown since the frame at `since_s`, linearly in time. `newborn_source` is -2 for a segment that
+        each antenna has grown since the frame at `since_s`, linearly in time; `depth_m` is its z. `newborn_source` is -2 for a segment that
         goes on; a newborn one inherits evidence and phasors of this slot as it was at the last frame, -1 those of slot 0.
         Cost: reads x segments, and one copy of the state for the newborn segments.
         """
@@ -96,7 +97,7 @@ class DwellEvidence(eqx.Module):
             distance_m = last_m[read.antenna] + part * increment_m[read.antenna]
             real, imaginary = (jnp.where(goes_on, row, 0.0) for row in rows[:2])
             moved_m = jnp.where(goes_on, distance_m - rows[2], 0.0)
-            real, imaginary = reader.moved(real, imaginary, moved_m, read.carrier_hz)
+            real, imaginary = reader.moved(real, imaginary, moved_m, depth_m, read.carrier_hz)
             concentration = reader.concentration(read.rssi_dbm, ~moving)
             evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
             return evidence, (real, imaginary, distance_m)

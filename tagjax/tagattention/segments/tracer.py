@@ -188,8 +188,9 @@ class TagAttention(AbstractTracer):
         dwell, log_likelihood = state.dwell, jnp.zeros((frame.present.shape[0], found.area.shape[0]))
         if self.dwell is not None and dwell is not None:
             dwell, log_likelihood = self.dwell.step(
-                self.reader, dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
-            )
+                self.reader, dwell, frame.arrivals, found.increment_m, found.centre_m[:, 2], found.source,
+                since_s, now_s,
+            )  # fmt: skip
             if self.hidden is not None and state.hidden is not None:
                 newborn = found.source > -2
                 log_likelihood = self.hidden.inherited(state.hidden, log_likelihood, found.centre_m, newborn)
@@ -202,7 +203,7 @@ class TagAttention(AbstractTracer):
                 attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
             )
             log_likelihood = log_likelihood + self.attention.weight.value * agreed
-        body, membership = self._bodies(state.body, log_likelihood, found, since_s, now_s)
+        body, membership, place = self._bodies(state.body, log_likelihood, found, since_s, now_s)
         membership = jnp.where(frame.present[:, None], membership, 0.0)
         weight = membership * found.area[None]
         total = jnp.sum(weight, axis=1)
@@ -210,8 +211,11 @@ class TagAttention(AbstractTracer):
         def mean(values: Float[Array, "... segment"]) -> Float[Array, "tag ..."]:
             return safe_divide(weight @ values, jnp.broadcast_to(total[:, None], (total.shape[0], values.shape[-1])))
 
-        body_nats = safe_divide(jnp.sum(weight * log_likelihood, axis=1), total)
-        body_nats = jnp.where(total > 0, body_nats, -1e4)
+        # Parts that move against the tag's place (legs, say) belong to the body, and have less evidence than the place.
+        at_place = membership * place
+        mass = jnp.sum(at_place, axis=1)
+        body_nats = safe_divide(jnp.sum(at_place * log_likelihood, axis=1), mass)
+        body_nats = jnp.where((total > 0) & (mass > 0), body_nats, -1e4)
         hidden, hides = state.hidden, jnp.zeros(total.shape, bool)
         if self.hidden is not None and hidden is not None and self.dwell is not None:
             velocity = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
@@ -239,11 +243,12 @@ class TagAttention(AbstractTracer):
         found: SegmentFrame,
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
-    ) -> tuple[BodyState | None, Float[Array, "tag segment"]]:
-        """The state of the bodies, and the probability that each segment belongs to each tag's."""
+    ) -> tuple[BodyState | None, Float[Array, "tag segment"], Float[Array, "tag segment"]]:
+        """The state of the bodies, the probability that each segment belongs to each tag's, and that of the tag's place."""
         if self.body is None or state is None:
             moving = (found.area > 0) & (jnp.arange(found.area.shape[0]) != STATIC)
-            return None, cut_segments(log_likelihood, moving)
+            membership = cut_segments(log_likelihood, moving)
+            return None, membership, membership * found.area[None]
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
         state, bodies = self.body.step(
             state, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source, since_s, now_s
@@ -252,7 +257,7 @@ class TagAttention(AbstractTracer):
         if self.whole is not None:
             moved = state.past.since(self.whole.lag_s, found.displacement_m, found.life_s, now_s)
             membership = self.whole.completed(membership, found, *moved)
-        return state, membership
+        return state, membership, bodies.place
 
     def camera_moved(self, state: TagAttentionState) -> Bool[Array, ""]:
         """Whether in two frames one after the other nearly all of the static background showed another depth."""
