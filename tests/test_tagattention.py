@@ -365,7 +365,7 @@ def test_even_odds_are_no_claim():
 def test_only_frames_and_reads_enter(clip):
     """The input of a tracer holds no labels, so its output cannot depend on truth; only error budgets give `objects`.
 
-    `colour` is for flow networks that learn; `later` is what such a pass backwards found.
+    `present` says which places hold a tag. `colour` is for flow networks that learn; `later` is what such a pass backwards found.
     """
     assert {
         "time_s",
@@ -374,6 +374,8 @@ def test_only_frames_and_reads_enter(clip):
         "forward_px",
         "radio",
         "reads",
+        "arrivals",
+        "present",
         "colour",
         "backward_message",
         "objects",

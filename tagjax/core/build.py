@@ -49,7 +49,9 @@ def with_modules(called: Callable[..., Any], settings: Mapping[str, Any], *, whe
     tuples. Raises
     `ConfigError` with the dotted path for arguments that a Module does not take, or refuses.
     """
-    hints = typing.get_type_hints(called.__init__ if isinstance(called, type) else called)
+    if not _is_module(called):
+        return dict(settings)
+    hints = typing.get_type_hints(called.__init__)
     parts = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
     for name, value in parts.items():
         classes = [one for one in (hints.get(name), *typing.get_args(hints.get(name))) if _is_module(one)]
