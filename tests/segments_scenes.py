@@ -70,3 +70,26 @@ def run(tracker: SegmentTracker, camera: Camera, frames, dt: float = DT_S) -> li
 
 def noisy(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (depth + rng.normal(0, 0.001, depth.shape)).astype(np.float32)
+
+
+def segment_frame(
+    centre_m, motion_m, *, area, life_s=0.0, displacement_m=None, source=None, size_m=0.06
+) -> SegmentFrame:
+    """A frame of segments with this motion, all of it known; slot 0 is the background. No pixels."""
+    num_segments = len(area)
+    motion_m = jnp.asarray(motion_m, jnp.float32)
+    return SegmentFrame(
+        labels=jnp.zeros((1, 1), jnp.int32),
+        increment_m=motion_m.T[:1],
+        motion_m=motion_m,
+        known=jnp.ones(num_segments, bool),
+        centre_m=jnp.asarray(centre_m, jnp.float32),
+        area=jnp.asarray(area, jnp.float32),
+        size_m=jnp.full(num_segments, size_m, jnp.float32),
+        life_s=jnp.broadcast_to(jnp.asarray(life_s, jnp.float32), (num_segments,)),
+        displacement_m=motion_m if displacement_m is None else jnp.asarray(displacement_m, jnp.float32),
+        moved=jnp.ones(num_segments, bool),
+        source=jnp.full(num_segments, -2, jnp.int32) if source is None else source,
+        num_unplaced=jnp.zeros((), jnp.int32),
+        background_lost=jnp.zeros(()),
+    )

@@ -155,7 +155,7 @@ def test_live_is_the_same_tracer(clip, traced):
         last = now
     places = [out.places[epc] for epc in EPCS]
     np.testing.assert_allclose(out.trace.box_px[jnp.array(places)], traced.box_px[-1], atol=1e-3)
-    np.testing.assert_allclose(out.trace.confidence[jnp.array(places)], traced.confidence[-1], atol=1e-2)
+    np.testing.assert_allclose(out.trace.tags.confidence[jnp.array(places)], traced.confidence[-1], atol=1e-2)
     with pytest.raises(ValueError, match="expected a later time"):
         live.process(np.asarray(one.colour[0]), one.depth_metres(0), last, new)
 

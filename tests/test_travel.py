@@ -1,4 +1,4 @@
-"""Motion pooled over what travels together, and the memory of a tag's place: closed forms, gradients, compiled or not."""
+"""Motion pooled over what travels together: closed forms, gradients, compiled or not."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from segments_scenes import segment_frame
 
-from tagjax.tagattention.segments import CarryingBody, PlaceMemory, TravellingTogether
+from tagjax.tagattention.segments import CarryingBody, TravellingTogether
 
 NUM = 24
 AREA = jnp.full(NUM, 16.0).at[0].set(500.0)
@@ -40,28 +41,28 @@ def walker(num_frames: int = 20, *, noise_m: float = 0.0, rate_hz: float = 10.0,
 
 
 def travelled(stage: TravellingTogether, frames):
-    """The pooled motion of each frame."""
+    """Each frame with pooled motion, and the pooling."""
     state, last_s = stage.init(NUM), jnp.asarray(-0.1)
     step = eqx.filter_jit(stage.step)
     for centre, motion, now_s in frames:
-        state, travel = step(state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, GOES_ON, last_s, now_s)
+        state, found, pooling = step(state, segment_frame(centre, motion, area=AREA), last_s, now_s)
         last_s = now_s
-        yield travel
+        yield found, pooling
 
 
 def test_pooling_averages_errors_away_and_leaves_what_travels_otherwise():
     noisy = list(walker(noise_m=0.02))
     errors, plain = [], []
-    for (_, motion, _), travel, (_, true, _) in zip(
+    for (_, motion, _), (travel, _), (_, true, _) in zip(
         noisy, travelled(TravellingTogether(), noisy), walker(), strict=True
     ):
         errors.append(travel.increment_m[0, 1:13] - true[1:13, 0])
         plain.append(motion[1:13, 0] - true[1:13, 0])
     assert np.std(errors[8:]) < 0.5 * np.std(plain[8:])
-    *_, travel = travelled(TravellingTogether(), walker(apart=True))
+    *_, (travel, pooling) = travelled(TravellingTogether(), walker(apart=True))
     np.testing.assert_allclose(travel.increment_m[0, 1:13], 0.12, atol=2e-3)
     np.testing.assert_allclose(travel.increment_m[0, 13:19], 0.02, atol=2e-3)
-    np.testing.assert_allclose(jnp.sum(travel.weight, axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(jnp.sum(pooling.weight, axis=1), 1.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("apart", [False, True])
@@ -71,7 +72,7 @@ def test_a_swinging_leg_belongs_to_the_walker_and_what_stays_behind_does_not(apa
     state, bodies = body.init(1, NUM), None
     step = eqx.filter_jit(body.step)
     frames = list(walker(apart=apart))
-    for (centre, _, now_s), travel in zip(frames, travelled(TravellingTogether(), frames), strict=True):
+    for (centre, _, now_s), (travel, _) in zip(frames, travelled(TravellingTogether(), frames), strict=True):
         state, bodies = step(
             state, evidence, centre, AREA, travel.life_s, travel.displacement_m, travel.source, last_s, now_s
         )
@@ -87,13 +88,11 @@ def test_a_new_segment_goes_on_from_its_source_or_the_nearest_mover():
     state, last_s = stage.init(NUM), jnp.asarray(-0.1)
     frames = list(walker())
     for centre, motion, now_s in frames[:-1]:
-        state, travel = stage.step(
-            state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, GOES_ON, last_s, now_s
-        )
+        state, _, _ = stage.step(state, segment_frame(centre, motion, area=AREA), last_s, now_s)
         last_s = now_s
     centre, motion, now_s = frames[-1]
     source = GOES_ON.at[5].set(3).at[13].set(-1).at[20].set(-1)
-    _, travel = stage.step(state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, source, last_s, now_s)
+    _, travel, _ = stage.step(state, segment_frame(centre, motion, area=AREA, source=source), last_s, now_s)
     np.testing.assert_allclose(travel.displacement_m[5], state.displacement_m[3], atol=1e-6)
     assert int(travel.source[13]) in range(1, 19)
     assert float(travel.displacement_m[13, 0]) > 1.5
@@ -105,72 +104,33 @@ def test_a_new_segment_goes_on_from_its_source_or_the_nearest_mover():
 
 def test_evidence_heals_towards_that_of_what_travels_together():
     stage = TravellingTogether()
-    *_, travel = travelled(stage, walker())
+    *_, (_, pooling) = travelled(stage, walker())
     log_likelihood = jnp.full((1, NUM), 0.0).at[0, 1:19].set(50.0).at[0, 4].set(0.0)
-    healed = stage.heal(travel, log_likelihood, jnp.asarray(1.0))
+    healed = stage.heal(pooling, log_likelihood, jnp.asarray(1.0))
     assert 30.0 < float(healed[0, 4]) < 50.0
     assert float(healed[0, 20]) < 1e-3
-    np.testing.assert_allclose(stage.heal(travel, log_likelihood, jnp.asarray(0.0)), log_likelihood, atol=1e-4)
-
-
-def test_a_hidden_body_lends_its_evidence_to_what_appears_where_it_must_be():
-    memory = PlaceMemory(reach=1.0, drift=0.5, loss_nats=10.0, young_s=0.5, memory_s=4.0, coast_s=2.0)
-    centre = jnp.zeros((NUM, 3)).at[:, 2].set(4.0).at[1:5, 1].set(jnp.array([-0.3, -0.1, 0.1, 0.3])).at[9, 0].set(3.0)
-    odds = jnp.full((1, NUM), -30.0).at[0, 1:5].set(30.0)
-    velocity = jnp.zeros((NUM, 3)).at[:, 0].set(1.0)
-    state = memory.update(memory.init(1), odds, jnp.full((1, NUM), 80.0), centre, velocity, AREA)
-    assert float(state.extent_m[0]) == pytest.approx(np.sqrt(0.05), rel=1e-3)
-    old, none = jnp.full(NUM, 9.0), jnp.zeros((1, NUM))
-    state, kept = memory.lend(state, none, centre, AREA, old, jnp.asarray(0.5))
-    np.testing.assert_array_equal(kept, none)
-    place_m = float(state.place_m[0, 0])
-    assert place_m == pytest.approx(0.5)
-    moved = centre.at[6, 0].set(place_m).at[7, 0].set(place_m + 0.2)
-    _, lent = memory.lend(state, none, moved, AREA, old.at[6:10].set(0.0), jnp.asarray(0.0))
-    kept_nats = 80.0 * np.exp(-0.5 / 4.0)
-    scale = 0.02 + np.sqrt(0.05) * (1.0 + 0.5 * 0.5)
-    assert float(lent[0, 6]) == pytest.approx(kept_nats, rel=1e-4)
-    assert float(lent[0, 7]) == pytest.approx(kept_nats - 10.0 * (0.2 / scale) ** 2, rel=1e-4)
-    assert float(lent[0, 9]) == 0.0
-    assert float(lent[0, 1]) == 0.0
-
-
-def test_another_body_with_less_evidence_does_not_replace_the_remembered_one():
-    memory = PlaceMemory(same=0.9)
-    centre, still = jnp.zeros((NUM, 3)).at[5:9, 0].set(2.0), jnp.zeros((NUM, 3))
-    first = jnp.full((1, NUM), -30.0).at[0, 1:5].set(30.0)
-    other = jnp.full((1, NUM), -30.0).at[0, 5:9].set(30.0)
-    state = memory.update(memory.init(1), first, jnp.full((1, NUM), 80.0), centre, still, AREA)
-    kept = memory.update(state, other, jnp.full((1, NUM), 60.0), centre, still, AREA)
-    taken = memory.update(state, other, jnp.full((1, NUM), 90.0), centre, still, AREA)
-    assert float(kept.place_m[0, 0]) == pytest.approx(0.0)
-    assert float(taken.place_m[0, 0]) == pytest.approx(2.0)
+    np.testing.assert_allclose(stage.heal(pooling, log_likelihood, jnp.asarray(0.0)), log_likelihood, atol=1e-4)
 
 
 def test_gradients_are_finite_and_compiled_is_eager():
-    stage, memory = TravellingTogether(), PlaceMemory()
+    stage = TravellingTogether()
     frames = list(walker(6))
 
-    def total(stage, memory, scale):
-        state, place, last_s, value = stage.init(NUM), memory.init(1), jnp.asarray(-0.1), 0.0
+    def total(stage, scale):
+        state, last_s, value = stage.init(NUM), jnp.asarray(-0.1), 0.0
         for centre, motion, now_s in frames:
-            motion = scale * motion
-            state, travel = stage.step(
-                state, motion.T[:1], motion, jnp.ones(NUM, bool), centre, AREA, GOES_ON, last_s, now_s
-            )
+            state, travel, pooling = stage.step(state, segment_frame(centre, scale * motion, area=AREA), last_s, now_s)
             evidence = jnp.cumsum(jnp.abs(travel.increment_m), axis=1) * 100.0
-            place, evidence = memory.lend(place, evidence, centre, AREA, travel.life_s, now_s - last_s)
-            evidence = stage.heal(travel, evidence, now_s - last_s)
-            place = memory.update(place, evidence - 5.0, evidence, centre, motion, AREA)
+            evidence = stage.heal(pooling, evidence, now_s - last_s)
             value, last_s = value + jnp.sum(jnp.sin(evidence)) + jnp.sum(travel.displacement_m), now_s
         return value
 
     one = jnp.ones(())
-    gradients = (*eqx.filter_grad(total)(stage, memory, one).__dict__.values(), jax.grad(total, 2)(stage, memory, one))
+    gradients = (eqx.filter_grad(total)(stage, one), jax.grad(total, 1)(stage, one))
     leaves = jax.tree.leaves(eqx.filter(gradients, eqx.is_inexact_array))
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
     assert float(jnp.abs(leaves[-1])) > 0
-    np.testing.assert_allclose(eqx.filter_jit(total)(stage, memory, one), total(stage, memory, one), rtol=1e-3)
+    np.testing.assert_allclose(eqx.filter_jit(total)(stage, one), total(stage, one), rtol=1e-3)
 
 
 @pytest.mark.parametrize("arguments", [{"num_active": 0}, {"num_newborn": 0}, {"lag_s": 0.0}, {"reach_m": -1.0}])

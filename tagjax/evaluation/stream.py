@@ -129,7 +129,9 @@ def _line(found: LiveFrame, stride: int, shape: tuple[int, int]) -> dict[str, An
     """What a frame says of every tag: boxes in pixels of the whole picture, places in the camera frame."""
     trace = found.trace
     boxes = box_to_picture(np.asarray(trace.box_px), stride, *shape)
-    confidence, detected, centre_m = (np.asarray(x) for x in (trace.confidence, trace.detected, trace.centre_m))
+    confidence, detected, centre_m = (
+        np.asarray(x) for x in (trace.tags.confidence, trace.tags.detected, trace.tags.centre_m)
+    )
     tags = {
         epc: {
             "detected": bool(detected[place]),

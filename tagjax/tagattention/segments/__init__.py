@@ -6,8 +6,6 @@ from .body import CarryingBody as CarryingBody
 from .detection import Detection as Detection
 from .dwell import DwellEvidence as DwellEvidence
 from .labels import Segmenter as Segmenter
-from .place_memory import PlaceMemory as PlaceMemory
-from .place_memory import PlaceState as PlaceState
 from .rigid import RigidMotion as RigidMotion
 from .step import SegmentFrame as SegmentFrame
 from .step import SegmentTracker as SegmentTracker

@@ -54,6 +54,11 @@ class AttentionState(eqx.Module):
             log_likelihood=jnp.zeros((num_tags, num_segments)),
         )
 
+    @property
+    def num_window(self) -> int:
+        """Frames in the window."""
+        return self.time_s.shape[0]
+
 
 class AttentionEvidence(eqx.Module):
     """Stage of Eqs. 4-7. The defaults are the paper's constants; it gives no floor and no memory."""

@@ -61,7 +61,7 @@ class CarryingBody(eqx.Module):
         *,
         temperature_nats: float = 8.0,
         fit_nats: float = 15.0,
-        evidence_nats: float = 60.0,
+        evidence_nats: float = 30.0,
         most_against: float = 4.0,
         prior: float = -1.0,
         neighbour_m: float = 0.08,

@@ -41,7 +41,7 @@ class HiddenBody(eqx.Module):
     stop_s: Positive  # a hidden body goes on at its last velocity, which decays with this time
 
     def __init__(
-        self, *, margin_nats: float = 20.0, reach_m: float = 0.15, drift_m_s: float = 0.2, stop_s: float = 0.3
+        self, *, margin_nats: float = 10.0, reach_m: float = 0.15, drift_m_s: float = 0.2, stop_s: float = 0.3
     ) -> None:
         """Raises `ValueError` for a value that is not positive."""
         self.margin_nats, self.reach_m = Positive(margin_nats), Positive(reach_m)

@@ -3,10 +3,12 @@
 A frame passes through them in this order:
 
 1. `segments`: depth and flow -> persistent segments and each one's motion (shared by all tags);
-2. `dwell`, with the `reader`'s noise model: this frame's reads -> evidence for each tag at each segment;
-3. `body`: evidence and motion in space -> which segments belong to the body that carries the tag;
-4. `hidden`: the last body -> its evidence where it comes out again, and whether the tag is out of view;
-5. `detection`: evidence for that body, and how recent it is -> the probability that the tag is on it.
+2. `travel`: what moves together -> motion that is pooled, and pasts that outlive a segment (shared as well);
+3. `dwell`, with the `reader`'s noise model: this frame's reads -> evidence for each tag at each segment;
+4. `body`: evidence and motion in space -> which segments belong to the rigid body that carries the tag;
+5. `whole`: what is connected with a body that walks, and gets on as it does -> the whole of it;
+6. `hidden`: the last body -> its evidence where it comes out again, and whether the tag is out of view;
+7. `detection`: evidence for that body, and how recent it is -> the probability that the tag is on it.
 """
 
 from __future__ import annotations
@@ -37,7 +39,6 @@ from .outline import (
     segment_boxes,
     segment_centroids,
 )
-from .place_memory import PlaceMemory, PlaceState
 from .step import SegmentFrame, SegmentTracker, SegmentTrackerState
 from .travel import TravellingTogether, TravelState
 from .whole import WholeBody
@@ -48,7 +49,6 @@ class TagState(eqx.Module):
 
     time_s: Float[Array, ""]  # of the last frame; NaN before the first
     travel: TravelState | None
-    place: PlaceState | None
     dwell: DwellState
     attention: AttentionState | None
     body: BodyState
@@ -90,7 +90,6 @@ class TagAttention(AbstractTracer):
 
     segments: SegmentTracker = eqx.field(default_factory=SegmentTracker)
     travel: TravellingTogether | None = eqx.field(default_factory=TravellingTogether)
-    place: PlaceMemory | None = None
     reader: ReaderModel = eqx.field(default_factory=ReaderModel)
     dwell: DwellEvidence = eqx.field(default_factory=DwellEvidence)
     attention: AttentionEvidence | None = None
@@ -101,28 +100,25 @@ class TagAttention(AbstractTracer):
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         """The state before the first frame."""
-        return TagAttentionState(self.segments.init(camera), self._no_tags(camera, frame))
-
-    def _no_tags(self, camera: Camera, frame: Frame) -> TagState:
         assert frame.present is not None
-        num_tags, num_antennas = frame.present.shape[-1], camera.antennas_m.shape[0]
+        num_window = 0 if self.attention is None else frame.radio.relative_m.shape[-1]
+        tags = self._no_reads(frame.present.shape[-1], camera.antennas_m.shape[0], num_window)
+        return TagAttentionState(self.segments.init(camera), tags)
+
+    def _no_reads(self, num_tags: int, num_antennas: int, num_window: int) -> TagState:
         num_segments = self.segments.segmenter.num_segments
+        attention = None
+        if self.attention is not None:
+            attention = AttentionState.nothing(num_tags, num_antennas, num_segments, num_window)
         return TagState(
             time_s=jnp.asarray(jnp.nan, jnp.float32),
             travel=None if self.travel is None else self.travel.init(num_segments),
-            place=None if self.place is None else self.place.init(num_tags),
             dwell=DwellState.nothing(num_tags, num_antennas, num_segments),
-            attention=self._no_attention(frame, num_segments),
+            attention=attention,
             body=self.body.init(num_tags, num_segments),
             hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
             num_reads=jnp.zeros(num_tags),
         )
-
-    def _no_attention(self, frame: Frame, num_segments: int) -> AttentionState | None:
-        if self.attention is None:
-            return None
-        num_tags, num_antennas, num_window = frame.radio.relative_m.shape
-        return AttentionState.nothing(num_tags, num_antennas, num_segments, num_window)
 
     def associate(self, state: TagState, found: SegmentFrame, frame: Frame) -> tuple[TagState, Association]:
         """The next state of the tags and their bodies, from a frame's segments and reads."""
@@ -137,13 +133,9 @@ class TagAttention(AbstractTracer):
         dwell, log_likelihood = self.dwell.step(
             self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
         )
-        hidden, place = state.hidden, state.place
+        hidden = state.hidden
         if self.hidden is not None and hidden is not None:
             log_likelihood = self.hidden.inherited(hidden, log_likelihood, found.centre_m, found.source > -2)
-        if self.place is not None and place is not None:
-            place, log_likelihood = self.place.lend(
-                place, log_likelihood, found.centre_m, found.area, found.life_s, dt_s
-            )
         if self.travel is not None and pooling is not None:
             log_likelihood = self.travel.heal(pooling, log_likelihood, dt_s)
         dwell = eqx.tree_at(lambda d: d.log_likelihood, dwell, log_likelihood)
@@ -158,11 +150,6 @@ class TagAttention(AbstractTracer):
             state.body, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source,
             since_s, now_s,
         )  # fmt: skip
-        if self.place is not None and place is not None:
-            moved, el = body.past.since(0.33, found.displacement_m, found.life_s, now_s)
-            place = self.place.update(
-                place, bodies.log_odds, evidence, found.centre_m, moved / jnp.maximum(el, 0.1)[:, None], found.area
-            )
         membership = jax.nn.sigmoid(bodies.log_odds)
         if self.whole is not None:
             moved = body.past.since(self.whole.lag_s, found.displacement_m, found.life_s, now_s)
@@ -195,7 +182,7 @@ class TagAttention(AbstractTracer):
             confidence=confidence,
             detected=self.detection.detected(confidence),
         )
-        return TagState(now_s, travel, place, dwell, attention, body, hidden, num_reads), out
+        return TagState(now_s, travel, dwell, attention, body, hidden, num_reads), out
 
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
         """The next state and the output on segments, without dense masks."""
@@ -232,36 +219,20 @@ class TagAttention(AbstractTracer):
 
     def with_tags(self, camera: Camera, state: TagAttentionState, source: Int[Array, " tag"]) -> TagAttentionState:
         """The state for other tags: `source` is each one's place among the present ones, -1 for a new tag."""
-        num_tags, num_segments = source.shape[0], self.segments.segmenter.num_segments
-        fresh = (
-            DwellState.nothing(num_tags, camera.antennas_m.shape[0], num_segments),
-            jnp.zeros((num_tags, num_segments)),
-            jnp.zeros(num_tags),
-        )
+        num_window = 0 if state.tags.attention is None else state.tags.attention.num_window
+        fresh = self._no_reads(source.shape[0], camera.antennas_m.shape[0], num_window)
 
         def moved(new: Array, old: Array) -> Array:
             known = (source >= 0).reshape(-1, *[1] * (new.ndim - 1))
             return jnp.where(known, old[jnp.maximum(source, 0)], new)
 
-        def per_tag(one: TagAttentionState) -> list[Any]:
-            dwell = one.dwell
-            found = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
-            found += [one.body.membership, one.num_reads]
-            return found + ([one.attention.log_likelihood] if one.attention is not None else [])
-
-        dwell, table, row = fresh
-        new = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood, table, row, table]
-        old = per_tag(state)
-        return eqx.tree_at(per_tag, state, [moved(one, other) for one, other in zip(new, old, strict=False)])
+        leaves = [moved(new, old) for new, old in zip(_of_tags(fresh), _of_tags(state.tags), strict=True)]
+        return TagAttentionState(state.segments, eqx.tree_at(_of_tags, state.tags, leaves))
 
     def shifted(self, state: TagAttentionState, by_s: Float[Array, ""]) -> TagAttentionState:
         """The state with all times later by `by_s`: for another origin of time."""
-
-        def times(one: TagAttentionState) -> list[Any]:
-            found = [one.time_s, one.body.past.time_s]
-            return found + ([one.attention.time_s] if one.attention is not None else [])
-
-        return eqx.tree_at(times, state, [one + by_s for one in times(state)])
+        times = _times(state.tags)
+        return TagAttentionState(state.segments, eqx.tree_at(_times, state.tags, [one + by_s for one in times]))
 
     def physical(self) -> dict[str, float]:
         """The learnable parameters in physical units, by dotted name."""
@@ -270,3 +241,23 @@ class TagAttention(AbstractTracer):
     def with_physical(self, values: Mapping[str, float]) -> TagAttention:
         """The tracer with these parameters in place of its own. Raises `ValueError` for other names, or impossible values."""
         return with_named_values(self, values)
+
+
+def _of_tags(state: TagState) -> list[Any]:
+    """The arrays with one row a tag."""
+    dwell = state.dwell
+    found = [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
+    found += [state.body.membership, state.num_reads]
+    if state.attention is not None:
+        found.append(state.attention.log_likelihood)
+    return found + jax.tree.leaves(state.hidden)
+
+
+def _times(state: TagState) -> list[Any]:
+    """The arrays of times."""
+    found = [state.time_s, state.body.past.time_s]
+    if state.travel is not None:
+        found.append(state.travel.past.time_s)
+    if state.attention is not None:
+        found.append(state.attention.time_s)
+    return found

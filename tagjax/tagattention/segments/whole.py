@@ -72,7 +72,7 @@ class WholeBody(eqx.Module):
             share = safe_divide(jnp.sum(going), jnp.sum(weight))
             goes = jax.nn.sigmoid((share - self.share.value) / 0.1)
             of_body = jax.ops.segment_sum(going, body, at.shape[0])
-            same = body == jnp.argmax(of_body)
+            same = body == jnp.argmax(of_body).astype(body.dtype)
             more = jnp.where(same, _MOST * goes * travels, 0.0)
             return own.at[at].set(1.0 - (1.0 - own[at]) * (1.0 - more))
 
