@@ -30,4 +30,4 @@ def test_unknown_cases_and_empty_pictures_are_refused():
         from_mapping(BenchmarkSettings, {"cases": ["warp"]})
     with pytest.raises(ValueError, match="at least 32x32"):
         BenchmarkSettings(height=1)
-    assert set(CASES) - set(BenchmarkSettings().cases) == {"training"}  # which takes minutes
+    assert set(CASES) - set(BenchmarkSettings().cases) == {"training", "tracer"}  # which take minutes

@@ -31,6 +31,21 @@ class Timing:
         return self.ours_ms / self.peer_ms
 
 
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """One measurement beside the highest value that it should have."""
+
+    what: str
+    value: float
+    unit: str  # empty for a ratio
+    aim: float | None = None
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether the aim is reached; None without one."""
+        return None if self.aim is None else self.value <= self.aim
+
+
 def median_ms(function: Callable[[], Any], repeats: int) -> float:
     """Median time of a call, milliseconds, after one call to warm up."""
     return medians_ms({"": function}, repeats)[""]
@@ -56,12 +71,12 @@ def first_call_s(function: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def in_separate_process(code: str, what: str) -> dict[str, float]:
+def in_separate_process(code: str, what: str, *, environment: Mapping[str, str] | None = None) -> dict[str, float]:
     """The JSON on the last line that Python code prints in a fresh process, so that its memory can be measured.
 
-    Raises `RuntimeError` with `what` in its message if the process fails.
+    `environment` None is that of this process. Raises `RuntimeError` with `what` in its message if the process fails.
     """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         raise RuntimeError(f"{what} failed: {done.stderr.strip()[-500:]}")
     return json.loads(done.stdout.splitlines()[-1])

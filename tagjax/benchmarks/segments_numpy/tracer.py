@@ -34,7 +34,7 @@ class NumpyTrace:
 
 
 class NumpyTracer:
-    """Holds the state; `follow` takes the next frame, whose leaves are NumPy arrays.
+    """Holds the state; `follow` takes the next frame.
 
     Raises `ValueError` for a tracer with a stage that has no counterpart here.
     """
