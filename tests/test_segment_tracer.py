@@ -160,6 +160,22 @@ def test_live_is_the_same_tracer(clip, traced):
         live.process(np.asarray(one.colour[0]), one.depth_metres(0), last, new)
 
 
+def test_a_live_tracer_compiles_its_step_once(clip):
+    """The types of the state, weak ones as well, are the same before the first frame and after it."""
+
+    def types(state):
+        return [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(state)]
+
+    first = jax.tree.map(lambda leaf: leaf[0], clip.frames)
+    tracer = eqx.tree_at(lambda t: t.attention, TRACER, AttentionEvidence(), is_leaf=lambda leaf: leaf is None)
+    begin = eqx.filter_eval_shape(tracer.init, clip.camera, first)
+    other = eqx.filter_eval_shape(tracer.with_tags, clip.camera, begin, jnp.arange(2))
+    later = eqx.filter_eval_shape(tracer.shifted, begin, jnp.zeros(()))
+    after, _ = eqx.filter_eval_shape(tracer.follow, clip.camera, begin, first)
+    for state in (other, later, after):
+        assert types(state) == types(begin)
+
+
 def test_the_configuration_is_the_default():
     settings = {name: value for name, value in yaml.safe_load(CONF.read_text()).items() if name != "clips"}
     built = build(settings, {settings["_target_"]: TagAttention}, where="tracer")
