@@ -19,7 +19,7 @@ from tagjax.tagattention.segments.attention import AttentionEvidence
 from tagjax.tracing.clips import load_clip
 
 NUM_FRAMES = 40
-TRACER = TagAttention(segments=SegmentTracker(segmenter=Segmenter(num_segments=512)))
+TRACER = TagAttention(segments=SegmentTracker(segmenter=Segmenter(num_segments=1024)))
 
 
 @pytest.fixture(scope="module")

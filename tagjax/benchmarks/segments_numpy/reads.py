@@ -77,6 +77,7 @@ class Dwells:
         source: Int[np.ndarray, " segment"],
         since_s: np.float32,
         now_s: np.float32,
+        exists: Bool[np.ndarray, " segment"],
     ) -> Float[np.ndarray, "tag segment"]:
         """The evidence after a frame, nats: the state's own array."""
         new = np.flatnonzero(source > -2)
@@ -87,33 +88,42 @@ class Dwells:
         self.log_likelihood *= np.exp(-(now_s - since_s) / self.memory_s)
         increment_m = increment_m.copy()
         increment_m[:, 0] = 0
+        # A frame without depth shows no segment, but they are there.
+        slots = np.union1d(0, np.flatnonzero(exists)) if exists.any() else np.arange(len(source))
         for at in _rounds(arrivals["tag"], arrivals["valid"]):
-            self._add(at, arrivals, increment_m, since_s, now_s)
+            self._add(at, slots, arrivals, increment_m, since_s, now_s)
         self.distance_m += increment_m
         return self.log_likelihood
 
     def _add(
-        self, at: np.ndarray, arrivals: Reads, increment_m: np.ndarray, since_s: np.float32, now_s: np.float32
+        self,
+        at: np.ndarray,
+        slots: np.ndarray,
+        arrivals: Reads,
+        increment_m: np.ndarray,
+        since_s: np.float32,
+        now_s: np.float32,
     ) -> None:
-        """Add the reads `at`, all of different tags."""
+        """Add the reads `at`, all of different tags, at the segments `slots`."""
         tag, antenna, time_s = arrivals["tag"][at], arrivals["antenna"][at], arrivals["time_s"][at]
         carrier_hz, rssi_dbm = arrivals["carrier_hz"][at], arrivals["rssi_dbm"][at]
         span_s = max(now_s - since_s, np.float32(original._SHORTEST_FRAME_S))
         part = np.clip((time_s - since_s) / span_s, 0, 1).astype(np.float32)
-        distance_m = self.distance_m[antenna] + part[:, None] * increment_m[antenna]
+        distance_m = self.distance_m[:, slots][antenna] + part[:, None] * increment_m[:, slots][antenna]
+        rows = tag[:, None], antenna[:, None], slots
         goes_on = (arrivals["channel"][at] == self.channel[tag, antenna])[:, None]
-        phasor = np.where(goes_on, self.phasor[tag, antenna], np.complex64(0))
-        moved_m = np.where(goes_on, distance_m - self.read_m[tag, antenna], np.float32(0))
+        phasor = np.where(goes_on, self.phasor[rows], np.complex64(0))
+        moved_m = np.where(goes_on, distance_m - self.read_m[rows], np.float32(0))
         value = self.reader.value
         concentration = np.empty(distance_m.shape, np.float32)
         concentration[:] = self.reader.concentration(rssi_dbm, value["spread_rad"])[:, None]
         concentration[:, 0] = self.reader.concentration(rssi_dbm, value["still_spread_rad"])
         phasor = self.reader.moved(phasor, moved_m, carrier_hz)
         evidence, phasor = self.reader.add(phasor, concentration, arrivals["phase_rad"][at])
-        self.phasor[tag, antenna], self.read_m[tag, antenna] = phasor, distance_m
+        self.phasor[rows], self.read_m[rows] = phasor, distance_m
         self.channel[tag, antenna] = arrivals["channel"][at]
         fresh = np.exp(-np.maximum(now_s - time_s, 0) / self.memory_s)
-        self.log_likelihood[tag] += fresh[:, None] * evidence
+        self.log_likelihood[tag[:, None], slots] += fresh[:, None] * evidence
 
 
 def _rounds(tag: Int[np.ndarray, " read"], valid: Bool[np.ndarray, " read"]) -> list[np.ndarray]:

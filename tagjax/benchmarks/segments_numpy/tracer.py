@@ -115,7 +115,7 @@ class NumpyTracer:
         dt_s = now_s - since_s
         pooling = None if self.travel is None else self.travel.step(found, dt_s, now_s)
         arrivals = {name: np.asarray(values) for name, values in vars(frame.arrivals).items()}
-        nats = self.dwells.step(arrivals, found.increment_m, found.source, since_s, now_s)
+        nats = self.dwells.step(arrivals, found.increment_m, found.source, since_s, now_s, found.exists)
         if self.hidden is not None:
             self.hidden.inherit(nats, found)
         if self.travel is not None and pooling is not None:

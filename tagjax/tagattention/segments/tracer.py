@@ -131,7 +131,7 @@ class TagAttention(AbstractTracer):
         if self.travel is not None and travel is not None:
             travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
         dwell, log_likelihood = self.dwell.step(
-            self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s
+            self.reader, state.dwell, frame.arrivals, found.increment_m, found.source, since_s, now_s, found.area > 0
         )
         hidden = state.hidden
         if self.hidden is not None and hidden is not None:
