@@ -17,6 +17,7 @@ from ...core.constrained import Positive
 from ...core.numerics import safe_divide, safe_norm
 from .past_motion import PastMotion
 from .rigid import RigidMotion
+from .travel import squared_distance
 
 _TINY = 1e-9
 
@@ -136,7 +137,7 @@ class CarryingBody(eqx.Module):
         there = exists[active]
         centre, size = centre_m[active], jnp.where(there, area[active], 0.0)
 
-        close = jnp.sum(jnp.square(centre[:, None] - centre[None]), axis=-1) < jnp.square(self.neighbour_m.value)
+        close = squared_distance(centre, centre) < jnp.square(self.neighbour_m.value)
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
         lagged = [past.since(lag, displacement_m, life_s, now_s) for lag in self.rigid.lags_s]
