@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ...recording import Recording
+from ...recording.store import open_recording
 from ..timing import Figure, Timing
 from .live import frame_times_ms, start_times_s, stream_memory_mib
 from .stages import part_times_ms, prepared_frames, radio_times_ms, twin_times_ms
@@ -51,14 +53,15 @@ def tracer_figures(settings: TracerSpeedSettings, seed: int) -> Iterator[Timing 
         path = Path(folder) / "benchmark.zarr" if settings.recording is None else Path(settings.recording)
         if settings.recording is None:
             stored_scene(path, width=settings.width, num_frames=settings.simulated_frames, seed=seed)
-        yield from _whole(settings, path)
-        yield from _parts(settings, path, seed)
+        recording = open_recording(path)
+        yield from _whole(settings, recording)
+        yield from _parts(settings, recording, seed)
         if settings.processes:
             yield from _processes(settings, path)
 
 
-def _whole(settings: TracerSpeedSettings, path: Path) -> Iterator[Figure]:
-    swing = Swing.of(path, num_tags=_FEW)
+def _whole(settings: TracerSpeedSettings, recording: Recording) -> Iterator[Figure]:
+    swing = Swing.of(recording, num_tags=_FEW)
     size = f"{swing.intrinsics.width}x{swing.intrinsics.height}"
     (times,) = frame_times_ms([swing], settings.frames, stride=settings.stride, flow=settings.flow, with_masks=True)
     what = f"frame of {size} with {settings.flow}, {_FEW} tags and their dense masks"
@@ -68,7 +71,7 @@ def _whole(settings: TracerSpeedSettings, path: Path) -> Iterator[Figure]:
     growth = float(np.median(times[early:]) / np.median(times[:early]))
     yield Figure(f"the same, after the first {early} frames over these", growth, "", 1.1)
     one, many = frame_times_ms(
-        [Swing.of(path, num_tags=number) for number in (1, _MANY)], settings.part_frames,
+        [Swing.of(recording, num_tags=number) for number in (1, _MANY)], settings.part_frames,
         stride=settings.stride, flow=settings.flow, with_masks=False,
     )  # fmt: skip
     yield Figure("frame, 1 tag, box only", float(np.median(one)), "ms")
@@ -76,9 +79,9 @@ def _whole(settings: TracerSpeedSettings, path: Path) -> Iterator[Figure]:
     yield Figure(f"frame, {_MANY} tags over 1", float(np.median(many) / np.median(one)), "", 2.5)
 
 
-def _parts(settings: TracerSpeedSettings, path: Path, seed: int) -> Iterator[Timing | Figure]:
+def _parts(settings: TracerSpeedSettings, recording: Recording, seed: int) -> Iterator[Timing | Figure]:
     for num_tags, aim in ((_FEW, 1.0), (_MANY, 0.5)):
-        swing = Swing.of(path, num_tags=num_tags)
+        swing = Swing.of(recording, num_tags=num_tags)
         camera, frames, flow_ms = prepared_frames(
             swing, settings.part_frames, stride=settings.stride, flow=settings.flow
         )

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from ...flow.registry import make_flow
+from ...recording.store import open_recording
 from ...tagattention.segments import TagAttention
 from ...tagattention.segments.outline import dense_masks
 from ...tracing.clips import choose_antennas
@@ -86,12 +87,8 @@ def stream_memory_mib(path: Path, num_frames: int, *, num_tags: int, stride: int
     return in_separate_process(code, "The process whose memory is measured")["peak_mib"]
 
 
-def _trace(path: str, num_frames: int, num_tags: int, stride: int, flow: str) -> None:
-    frame_times_ms([Swing.of(Path(path), num_tags=num_tags)], num_frames, stride=stride, flow=flow, with_masks=True)
-
-
 def _first_mask(path: str, num_tags: int, stride: int, flow: str) -> None:
-    swing = Swing.of(Path(path), num_tags=num_tags)
+    swing = Swing.of(open_recording(path), num_tags=num_tags)
     tracer = live_tracer(swing, stride=stride, flow=flow)
     for shot in swing.shots(2):  # the second has flow
         trace = tracer.process(shot.colour, shot.depth_m, shot.time_ns, shot.reads).trace
@@ -101,5 +98,6 @@ def _first_mask(path: str, num_tags: int, stride: int, flow: str) -> None:
 
 
 def _stream(path: str, num_frames: int, num_tags: int, stride: int, flow: str) -> None:
-    _trace(path, num_frames, num_tags, stride, flow)
+    swing = Swing.of(open_recording(path), num_tags=num_tags)
+    frame_times_ms([swing], num_frames, stride=stride, flow=flow, with_masks=True)
     print(json.dumps({"peak_mib": peak_memory_mib()}))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...recording import Intrinsics, Recording, TagReads
 from ...recording.reads import concatenate_reads, join_reads
-from ...recording.store import open_recording, save_recording
+from ...recording.store import save_recording
 from ...recording.time_reversal import time_reversed
 from ...sim.record import CaptureSettings, simulate_recording
 from ...sim.stories import build_scenario
@@ -29,7 +29,7 @@ class Shot:
 def stored_scene(path: Path, *, width: int, num_frames: int, seed: int) -> None:
     """Simulate and store four objects in the hands of two people, with a third person who walks behind them."""
     settings = {"kinds": ["bottle", "toy", "box", "bag"], "num_walkers": 1, "stationary_s": 0.3}
-    scenario = build_scenario("handheld", np.random.default_rng(seed), num_frames / 30 + 1.0, settings)
+    scenario = build_scenario("handheld", np.random.default_rng(seed), num_frames / 30 + 0.2, settings)
     capture = CaptureSettings(width=width, shadows=False)
     save_recording(simulate_recording(scenario, capture, seed=seed, name="benchmark", num_frames=num_frames), path)
 
@@ -45,9 +45,8 @@ class Swing:
     reads: TagReads  # of a period, from its start
 
     @staticmethod
-    def of(path: Path, *, num_tags: int) -> Swing:
-        """The stored recording with this number of tags: its own, or copies of them with other phase offsets."""
-        recording = open_recording(path)
+    def of(recording: Recording, *, num_tags: int) -> Swing:
+        """The recording with this number of tags: its own, or copies of them with other phase offsets."""
         time_ns = np.asarray(recording.time_ns, np.int64)
         begin_ns, length_ns = int(time_ns[0]), int(time_ns[-1] - time_ns[0])
         forth = np.arange(len(time_ns))
