@@ -13,7 +13,7 @@ from ...recording import Recording
 from ...recording.store import open_recording
 from ..timing import Figure, Timing
 from .live import frame_times_ms, start_times_s, stream_memory_mib
-from .stages import part_times_ms, prepared_frames, radio_times_ms, twin_times_ms
+from .stages import flow_times_ms, part_times_ms, prepared_frames, radio_times_ms, twin_times_ms
 from .swing import Swing, stored_scene
 
 _FEW, _MANY = 4, 64
@@ -35,7 +35,7 @@ class TracerSpeedSettings:
     width: int = 512  # of the simulated pictures
     simulated_frames: int = 90
     stride: int = 2  # every n-th pixel
-    flow: str = "dis"
+    flow: str = "dis_stride4"
     frames: int = 600  # of the longest run; those after the first 300 say whether time grows with the recording
     part_frames: int = 120  # of the other runs
     processes: bool = True  # also measure fresh processes: first mask, memory
@@ -70,6 +70,10 @@ def _whole(settings: TracerSpeedSettings, recording: Recording) -> Iterator[Figu
     early = min(_EARLY, len(times) // 2)
     growth = float(np.median(times[early:]) / np.median(times[:early]))
     yield Figure(f"the same, after the first {early} frames over these", growth, "", 1.1)
+    (ahead,) = frame_times_ms(
+        [swing], settings.part_frames, stride=settings.stride, flow=settings.flow, with_masks=True, ahead=True
+    )
+    yield Figure("the same, its result awaited during the next frame's flow", float(np.mean(ahead)), "ms")
     one, many = frame_times_ms(
         [Swing.of(recording, num_tags=number) for number in (1, _MANY)], settings.part_frames,
         stride=settings.stride, flow=settings.flow, with_masks=False,
@@ -82,11 +86,11 @@ def _whole(settings: TracerSpeedSettings, recording: Recording) -> Iterator[Figu
 def _parts(settings: TracerSpeedSettings, recording: Recording, seed: int) -> Iterator[Timing | Figure]:
     for num_tags, aim in ((_FEW, 1.0), (_MANY, 0.5)):
         swing = Swing.of(recording, num_tags=num_tags)
-        camera, frames, flow_ms = prepared_frames(
-            swing, settings.part_frames, stride=settings.stride, flow=settings.flow
-        )
+        camera, frames = prepared_frames(swing, settings.part_frames, stride=settings.stride, flow=settings.flow)
         if num_tags == _FEW:
-            yield Figure(f"part: flow ({settings.flow})", flow_ms, "ms")
+            flows = dict.fromkeys((settings.flow, "dis"))
+            for name, value in flow_times_ms(swing, settings.part_frames, flows=tuple(flows)).items():
+                yield Figure(f"part: flow ({name})", value, "ms")
         for name, value in part_times_ms(camera, frames).items():
             if num_tags == _FEW or name == "per-tag side":
                 yield Figure(f"part: {name}, {num_tags} tags", value, "ms")

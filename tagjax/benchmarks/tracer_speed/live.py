@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -43,19 +44,25 @@ def live_tracer(swing: Swing, *, stride: int, flow: str) -> LiveTracer:
 
 
 def frame_times_ms(
-    swings: Sequence[Swing], num_frames: int, *, stride: int, flow: str, with_masks: bool
+    swings: Sequence[Swing], num_frames: int, *, stride: int, flow: str, with_masks: bool, ahead: bool = False
 ) -> list[np.ndarray]:
-    """Times of `process` for each of some recordings, (frame,) ms; their frames alternate, so that other load hits all alike."""
+    """Times of `process` for each of some recordings, (frame,) ms; their frames alternate, so that other load hits all alike.
+
+    They include the wait for the result; with `ahead` that for the result of the frame before, so that a flow is computed
+    while the device is busy with the last frame: the time between frames at full speed.
+    """
     tracers = [live_tracer(swing, stride=stride, flow=flow) for swing in swings]
     times: list[list[float]] = [[] for _ in swings]
+    waiting: list[Any] = [()] * len(swings)
     for number, shots in enumerate(zip(*(swing.shots(num_frames + _WARM_UP) for swing in swings), strict=True)):
-        for tracer, shot, own in zip(tracers, shots, times, strict=True):
+        for place, (tracer, shot) in enumerate(zip(tracers, shots, strict=True)):
             begun = time.perf_counter()
             trace = tracer.process(shot.colour, shot.depth_m, shot.time_ns, shot.reads).trace
-            out = masks(trace.labels, trace.tags.membership) if with_masks else trace.box_px
-            jax.block_until_ready((trace, out))
+            found = trace, masks(trace.labels, trace.tags.membership) if with_masks else ()
+            jax.block_until_ready(waiting[place] if ahead else found)
+            waiting[place] = found
             if number >= _WARM_UP:
-                own.append(1e3 * (time.perf_counter() - begun))
+                times[place].append(1e3 * (time.perf_counter() - begun))
     return [np.array(own) for own in times]
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -61,9 +62,22 @@ def _dwell(inputs: tuple[TagAttention, Arrivals, Any, Any, Any, Any], state: Dwe
     return tracer.dwell.step(tracer.reader, state, arrivals, increment_m, source, now_s - _FRAME_S, now_s, exists)
 
 
-def prepared_frames(swing: Swing, num_frames: int, *, stride: int, flow: str) -> tuple[Camera, list[Frame], float]:
-    """The camera, the first frames with their flow, and the median time of a flow, ms."""
-    estimate, times, frames = make_flow(flow), [], []
+def flow_times_ms(swing: Swing, num_frames: int, *, flows: Sequence[str]) -> dict[str, float]:
+    """Median times of flows along the first pictures, which alternate, ms."""
+    estimates = {name: make_flow(name) for name in flows}
+    times: dict[str, list[float]] = {name: [] for name in flows}
+    pictures = [shot.colour for shot in swing.shots(num_frames)]
+    for last, picture in itertools.pairwise(pictures):
+        for name, estimate in estimates.items():
+            begun = time.perf_counter()
+            estimate(picture, last)
+            times[name].append(1e3 * (time.perf_counter() - begun))
+    return {name: float(np.median(own)) for name, own in times.items()}
+
+
+def prepared_frames(swing: Swing, num_frames: int, *, stride: int, flow: str) -> tuple[Camera, list[Frame]]:
+    """The camera, and the first frames with their flow."""
+    estimate, frames = make_flow(flow), []
     recording, epcs = swing.recording, swing.epcs
     antennas = choose_antennas(recording, recording.reads.epcs)
     rays = jnp.asarray(pixel_rays(swing.intrinsics.scaled(stride)))
@@ -76,9 +90,7 @@ def prepared_frames(swing: Swing, num_frames: int, *, stride: int, flow: str) ->
     for shot in swing.shots(num_frames):
         backward_px = no_flow
         if last is not None:
-            begun = time.perf_counter()
             backward_px = np.asarray(estimate(shot.colour, last.colour))[::stride, ::stride] / np.float32(stride)
-            times.append(1e3 * (time.perf_counter() - begun))
         since_ns = None if last is None else last.time_ns
         stamp = np.array([shot.time_ns])
         arrivals, _ = frame_arrivals(shot.reads, epcs, antennas, stamp, 0, MAX_ARRIVALS, since_ns=since_ns)
@@ -95,7 +107,7 @@ def prepared_frames(swing: Swing, num_frames: int, *, stride: int, flow: str) ->
             )
         )
         last = shot
-    return camera, frames, float(np.median(times))
+    return camera, frames
 
 
 def part_times_ms(camera: Camera, frames: list[Frame]) -> dict[str, float]:
