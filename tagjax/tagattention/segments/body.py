@@ -195,11 +195,11 @@ def _spread(
     """Weighted mean and variance (of all three coordinates together, m^2) of segments; 0 without weight."""
     share = safe_divide(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
     middle_m = share @ centre_m
-    return middle_m, share @ jnp.sum(jnp.square(centre_m - middle_m[None]), axis=-1)
+    return middle_m, share @ jnp.sum(jnp.square(centre_m.T - middle_m[:, None]), axis=0)
 
 
 def _distance_log(
     centre_m: Float[Array, "segment 3"], from_m: Float[Array, " 3"], variance_m2: Float[Array, ""]
 ) -> Float[Array, " segment"]:
     """Exponent of a normal distribution about a point."""
-    return -0.5 * jnp.sum(jnp.square(centre_m - from_m[None]), axis=-1) / variance_m2
+    return -0.5 * jnp.sum(jnp.square(centre_m.T - from_m[:, None]), axis=0) / variance_m2
