@@ -80,7 +80,7 @@ def test_names_of_cases_are_arguments(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.ci
 def test_the_tracer_is_measured_in_small():
     pytest.importorskip("mujoco", reason="needs the sim extra")
-    small = TracerSpeedSettings(width=64, simulated_frames=8, stride=1, frames=12, part_frames=8)
+    small = TracerSpeedSettings(width=64, simulated_frames=45, stride=1, frames=12, part_frames=8)
     found = list(tracer_figures(small, 0))
     figures = {one.what: one for one in found if isinstance(one, Figure)}
     assert all(np.isfinite(one.value) and one.value > 0 for one in figures.values())

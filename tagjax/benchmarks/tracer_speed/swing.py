@@ -29,7 +29,7 @@ class Shot:
 def stored_scene(path: Path, *, width: int, num_frames: int, seed: int) -> None:
     """Simulate and store four objects in the hands of two people, with a third person who walks behind them."""
     settings = {"kinds": ["bottle", "toy", "box", "bag"], "num_walkers": 1, "stationary_s": 0.3}
-    scenario = build_scenario("handheld", np.random.default_rng(seed), num_frames / 30 + 0.2, settings)
+    scenario = build_scenario("handheld", np.random.default_rng(seed), max(1.5, num_frames / 30 + 0.2), settings)
     capture = CaptureSettings(width=width, shadows=False)
     save_recording(simulate_recording(scenario, capture, seed=seed, name="benchmark", num_frames=num_frames), path)
 
