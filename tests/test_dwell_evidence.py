@@ -219,6 +219,32 @@ def test_padding_does_not_matter():
         np.testing.assert_array_equal(ours, other)
 
 
+@pytest.mark.parametrize("num_existing", [0, 200, 600])
+def test_slots_without_a_segment_change_nothing(num_existing):
+    num, rng, step = 700, np.random.default_rng(5), eqx.filter_jit(DwellEvidence().step)
+    slots = np.sort(rng.choice(np.arange(1, num), num_existing, replace=False))
+    exists = jnp.zeros(num, bool).at[slots].set(True)  # nowhere: a frame without depth
+    taken = np.append(0, slots) if num_existing else np.arange(num)
+    state = other = DwellState.nothing(3, 2, num)
+    found = every = jnp.zeros((3, num))
+    for reads, _, _, since, now in _frames(rng, num_frames=4):
+        increment_m = jnp.asarray(rng.normal(0, 0.01, (2, num)), jnp.float32)
+        source = np.full(num, -2, np.int32)
+        source[taken[-9:]] = [-1, *rng.choice(taken, 8)]
+        depth_m = jnp.linspace(1.0, 4.0, num)
+        given = _arrivals(reads), increment_m, depth_m, jnp.asarray(source), jnp.asarray(since), jnp.asarray(now)
+        state, found = step(ReaderModel(), state, *given, exists)
+        other, every = step(ReaderModel(), other, *given)
+        np.testing.assert_allclose(found[:, taken], every[:, taken], atol=1e-5)
+        for name in ("real", "imaginary", "read_m", "distance_m"):
+            one, two = (np.asarray(getattr(each, name))[..., taken] for each in (state, other))
+            np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-5, err_msg=name)
+        np.testing.assert_array_equal(state.channel, other.channel)
+    assert float(jnp.max(jnp.abs(every))) > 1
+    if num_existing == 200:  # and they are left out
+        assert bool(jnp.any(found != every))
+
+
 def test_evidence_of_two_antennas_adds_up():
     first, second = _still([1.0, 1.1, 0.9]), _still([2.0, 2.1, 1.9, 2.4], antenna=1)
     both = _once(sorted(first + second, key=lambda read: read[2]))[1]

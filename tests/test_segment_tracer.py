@@ -122,6 +122,7 @@ def test_a_batch_is_a_loop(clip, traced):
     np.testing.assert_allclose(found.mask[1], traced.mask, atol=1e-4)
 
 
+@pytest.mark.ci
 def test_every_stage_has_a_finite_gradient(clip):
     frames = jax.tree.map(lambda leaf: leaf[:24], clip.frames)
     tracer = eqx.tree_at(lambda t: t.attention, TRACER, AttentionEvidence(), is_leaf=lambda leaf: leaf is None)
@@ -159,6 +160,22 @@ def test_live_is_the_same_tracer(clip, traced):
     np.testing.assert_allclose(out.trace.tags.confidence[jnp.array(places)], traced.confidence[-1], atol=1e-2)
     with pytest.raises(ValueError, match="expected a later time"):
         live.process(np.asarray(one.colour[0]), one.depth_metres(0), last, one.reads[:0])
+
+
+def test_a_live_tracer_compiles_its_step_once(clip):
+    """The types of the state, weak ones as well, are the same before the first frame and after it."""
+
+    def types(state):
+        return [(leaf.shape, leaf.dtype, leaf.weak_type) for leaf in jax.tree.leaves(state)]
+
+    first = jax.tree.map(lambda leaf: leaf[0], clip.frames)
+    tracer = eqx.tree_at(lambda t: t.attention, TRACER, AttentionEvidence(), is_leaf=lambda leaf: leaf is None)
+    begin = eqx.filter_eval_shape(tracer.init, clip.camera, first)
+    other = eqx.filter_eval_shape(tracer.with_tags, clip.camera, begin, jnp.arange(2))
+    later = eqx.filter_eval_shape(tracer.shifted, begin, jnp.zeros(()))
+    after, _ = eqx.filter_eval_shape(tracer.follow, clip.camera, begin, first)
+    for state in (other, later, after):
+        assert types(state) == types(begin)
 
 
 def test_the_configuration_is_the_default():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import cv2
 import equinox as eqx
@@ -27,7 +27,8 @@ from ..tracing.clips import load_clip
 from ..tracing.range_windows import phase_reads, radio_windows
 from ..tracing.tracer import trace
 from .flow_speed import flow_timings
-from .timing import Timing, first_call_s, median_ms
+from .timing import Figure, Timing, first_call_s, median_ms
+from .tracer_speed import TracerSpeedSettings, tracer_figures
 from .training_speed import training_timings
 
 
@@ -40,6 +41,7 @@ class BenchmarkSettings:
     width: int = 512
     repeats: int = 7
     seed: int = 0
+    tracer: TracerSpeedSettings = dataclasses.field(default_factory=TracerSpeedSettings)
 
     def __post_init__(self):
         unknown = sorted(set(self.cases) - set(CASES))
@@ -212,7 +214,11 @@ def _training(settings: BenchmarkSettings) -> Iterator[Timing]:
     return training_timings(max(2, settings.repeats // 3), settings.seed)
 
 
-CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing] | Iterator[Timing]]] = {
+def _tracer(settings: BenchmarkSettings) -> Iterator[Timing | Figure]:
+    return tracer_figures(settings.tracer, settings.seed)
+
+
+CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | Iterable[Timing | Figure]]] = {
     "gather": _gather,
     "splat": _splat,
     "segment": _segment,
@@ -223,11 +229,14 @@ CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | list[Timing] | Iterat
     "pairs": _pairs,
     "flow": _flow,
     "training": _training,
+    "tracer": _tracer,
 }
 """The cases that can be measured, by name."""
 
 
-def run_benchmark(settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None) -> Iterator[Timing]:
+def run_benchmark(
+    settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None
+) -> Iterator[Timing | Figure]:
     """Measure the cases one after the other and yield each timing; `on_case` is called with the name of each case before it."""
     for name in settings.cases:
         if on_case is not None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -29,6 +30,21 @@ class Timing:
     def ratio(self) -> float:
         """Ours over the peer's: below 1 is faster."""
         return self.ours_ms / self.peer_ms
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """One measurement beside the highest value that it should have."""
+
+    what: str
+    value: float
+    unit: str  # empty for a ratio
+    aim: float | None = None
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether the aim is reached; None without one."""
+        return None if self.aim is None else self.value <= self.aim
 
 
 def median_ms(function: Callable[[], Any], repeats: int) -> float:
@@ -56,12 +72,12 @@ def first_call_s(function: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def in_separate_process(code: str, what: str) -> dict[str, float]:
+def in_separate_process(code: str, what: str, *, environment: Mapping[str, str] | None = None) -> dict[str, float]:
     """The JSON on the last line that Python code prints in a fresh process, so that its memory can be measured.
 
-    Raises `RuntimeError` with `what` in its message if the process fails.
+    `environment` None is that of this process. Raises `RuntimeError` with `what` in its message if the process fails.
     """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         raise RuntimeError(f"{what} failed: {done.stderr.strip()[-500:]}")
     return json.loads(done.stdout.splitlines()[-1])
@@ -69,6 +85,9 @@ def in_separate_process(code: str, what: str) -> dict[str, float]:
 
 def peak_memory_mib() -> float:
     """The largest resident memory of this process so far."""
+    status = Path("/proc/self/status")
+    if status.exists():  # Linux counts the memory of the process that started this one in `ru_maxrss`
+        return int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**10
     import resource  # not on every system
 
     unit = 2**20 if sys.platform == "darwin" else 2**10

@@ -35,7 +35,7 @@ class StreamConfig:
     recording: str
     tracer: Mapping[str, Any]
     weights: str | None = None
-    flow: str = "dis"
+    flow: str = "dis_stride4"
     stride: int | None = None  # None: that of the tracer's settings, or else of the picture's width
     num_places: int = 4  # for tags, before more are made
     replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)

@@ -27,12 +27,20 @@ _MIN_SIDE_PX = 16
 
 
 class DISFlow:
-    """Dense inverse search at one of OpenCV's presets: "ultrafast", "fast" or "medium". Raises `ValueError` for others."""
+    """Dense inverse search at one of OpenCV's presets: "ultrafast", "fast" or "medium".
 
-    def __init__(self, preset: str = "medium"):
+    Patches of 8 pixels lie `patch_stride` pixels apart, by default as the preset has it (3 in "medium"). Raises `ValueError`
+    for other presets and strides.
+    """
+
+    def __init__(self, preset: str = "medium", *, patch_stride: int | None = None):
+        if patch_stride is not None and not 1 <= patch_stride <= 8:
+            raise ValueError(f"patch_stride is {patch_stride}; expected 1 to 8 pixels: a patch has 8.")
         if preset not in DIS_PRESETS:
             raise ValueError(f"Unknown DIS preset {preset!r}; expected one of {', '.join(DIS_PRESETS)}.")
         self._dis = cv2.DISOpticalFlow.create(DIS_PRESETS[preset])
+        if patch_stride is not None:
+            self._dis.setPatchStride(patch_stride)
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         one, other = _grey_pair(first, second)
@@ -54,6 +62,7 @@ class FarnebackFlow:
 
 FLOWS: dict[str, Callable[[], FlowFunction]] = {
     "dis": DISFlow,
+    "dis_stride4": lambda: DISFlow(patch_stride=4),
     "dis_fast": lambda: DISFlow("fast"),
     "dis_ultrafast": lambda: DISFlow("ultrafast"),
     "farneback": FarnebackFlow,

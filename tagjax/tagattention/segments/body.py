@@ -17,6 +17,7 @@ from ...core.constrained import Positive
 from ...core.numerics import safe_divide, safe_norm
 from .past_motion import PastMotion
 from .rigid import RigidMotion
+from .travel import squared_distance
 
 _TINY = 1e-9
 
@@ -136,7 +137,7 @@ class CarryingBody(eqx.Module):
         there = exists[active]
         centre, size = centre_m[active], jnp.where(there, area[active], 0.0)
 
-        close = jnp.sum(jnp.square(centre[:, None] - centre[None]), axis=-1) < jnp.square(self.neighbour_m.value)
+        close = squared_distance(centre, centre) < jnp.square(self.neighbour_m.value)
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
         lagged = [past.since(lag, displacement_m, life_s, now_s) for lag in self.rigid.lags_s]
@@ -194,11 +195,11 @@ def _spread(
     """Weighted mean and variance (of all three coordinates together, m^2) of segments; 0 without weight."""
     share = safe_divide(weight, jnp.broadcast_to(jnp.sum(weight), weight.shape))
     middle_m = share @ centre_m
-    return middle_m, share @ jnp.sum(jnp.square(centre_m - middle_m[None]), axis=-1)
+    return middle_m, share @ jnp.sum(jnp.square(centre_m.T - middle_m[:, None]), axis=0)
 
 
 def _distance_log(
     centre_m: Float[Array, "segment 3"], from_m: Float[Array, " 3"], variance_m2: Float[Array, ""]
 ) -> Float[Array, " segment"]:
     """Exponent of a normal distribution about a point."""
-    return -0.5 * jnp.sum(jnp.square(centre_m - from_m[None]), axis=-1) / variance_m2
+    return -0.5 * jnp.sum(jnp.square(centre_m.T - from_m[:, None]), axis=0) / variance_m2

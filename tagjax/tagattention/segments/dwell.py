@@ -15,14 +15,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ...core.constrained import Positive
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
 
 _SHORTEST_FRAME_S = 1e-6
-_CHUNK = 16  # reads; a frame of 30 a second has 4 to 20 of them
+_CHUNK = 8  # reads: valid ones come first in a frame's buffer, which is mostly empty
+_FEW = 512  # segments: hardly ever more exist, after the first seconds
 
 _Rows = tuple[Array, Array, Array]
 
@@ -75,91 +76,111 @@ class DwellEvidence(eqx.Module):
         newborn_source: Int[Array, " segment"],
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
+        exists: Bool[Array, " segment"] | None = None,
     ) -> tuple[DwellState, Float[Array, "tag segment"]]:
         """The state after the frame at `now_s`, and the evidence in nats.
 
         `arrivals` are the reads in (since_s, now_s], in order of time; `increment_m` is what each segment's distance to
-        each antenna has grown since the frame at `since_s`, linearly in time; `depth_m` is its z. `newborn_source` is -2 for a segment that
-        goes on; a newborn one inherits evidence and phasors of this slot as it was at the last frame, -1 those of slot 0.
-        Cost: reads x segments, and one copy of the state for the newborn segments.
+        each antenna has grown since the frame at `since_s`, linearly in time, and `depth_m` its z. `newborn_source` is -2
+        for a segment that goes on; a newborn one inherits evidence and phasors of this slot as it was at the last frame, -1 those of slot 0.
+        Cost: reads x segments, and one copy of the state for the newborn segments. Slots that do not exist may be left out
+        of the reads, because nothing but a newborn segment will be there; with `exists` None, or nowhere, all take part.
         """
-        state = _inherit(state, newborn_source)
+        source = _sources(newborn_source)
         moving = jnp.arange(increment_m.shape[1]) > 0
         increment_m = jnp.where(moving, increment_m, 0.0)
-        last_m = state.distance_m
+        last_m = _taken(state.distance_m, source)
         memory_s = self.memory_s.value
         decay = jnp.exp(-(now_s - since_s) / memory_s)
         fraction = jnp.clip((arrivals.time_s - since_s) / jnp.maximum(now_s - since_s, _SHORTEST_FRAME_S), 0.0, 1.0)
         fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / memory_s)
 
-        def updated(rows: _Rows, read: Arrivals, part: Array, goes_on: Array) -> tuple[Array, _Rows]:
-            """The evidence of a read for every segment, and the rows of its tag and antenna after it."""
-            distance_m = last_m[read.antenna] + part * increment_m[read.antenna]
-            real, imaginary = (jnp.where(goes_on, row, 0.0) for row in rows[:2])
-            moved_m = jnp.where(goes_on, distance_m - rows[2], 0.0)
-            real, imaginary = reader.moved(real, imaginary, moved_m, depth_m, read.carrier_hz)
-            concentration = reader.concentration(read.rssi_dbm, ~moving)
-            evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
-            return evidence, (real, imaginary, distance_m)
-
-        def add(carry: tuple[_Rows, Array, Array], one: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
-            tables, channel, log_likelihood = carry
-            read, part, weight = one
-            at = read.tag * num_antennas + read.antenna
-            rows = tuple(jax.lax.dynamic_index_in_dim(table, at, keepdims=False) for table in tables)
-            # Padding costs nothing. What a read computes is computed again for gradients: kept, it takes 18 MB a frame.
-            evidence, rows = jax.lax.cond(
-                read.valid,
-                jax.checkpoint(updated, prevent_cse=False),
-                lambda rows, *_: (jnp.zeros_like(rows[0]), rows),
-                rows,
-                read,
-                part,
-                read.channel == channel[at],
-            )
-            own = jax.lax.dynamic_index_in_dim(log_likelihood, read.tag, keepdims=False) + weight * evidence
-            return (
-                tuple(jax.lax.dynamic_update_index_in_dim(t, row, at, 0) for t, row in zip(tables, rows, strict=True)),
-                channel.at[at].set(jnp.where(read.valid, read.channel, channel[at])),
-                jax.lax.dynamic_update_index_in_dim(log_likelihood, own, read.tag, 0),
-            ), None
-
-        def add_some(carry: tuple[_Rows, Array, Array], some: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
-            """Reads that are all padding cost one step, not one each: their gradients would take longer than the reads'."""
-            return jax.lax.cond(
-                jnp.any(some[0].valid), lambda now: jax.lax.scan(add, now, some)[0], lambda now: now, carry
-            ), None
-
         num_antennas, shape = increment_m.shape[0], state.real.shape
+        reads = _in_chunks((arrivals, fraction, fresh))
         tables = tuple(table.reshape(-1, shape[-1]) for table in (state.real, state.imaginary, state.read_m))
-        carry = (tables, state.channel.reshape(-1), decay * state.log_likelihood)
-        reads = jax.tree.map(_in_chunks, (arrivals, fraction, fresh))
-        (tables, channel, log_likelihood), _ = jax.lax.scan(add_some, carry, reads)
+        of_tags = tables, decay * state.log_likelihood
+
+        def scanned(
+            of_tags: tuple[_Rows, Array], last_m: Array, increment_m: Array, depth_m: Array, moving: Array
+        ) -> tuple[_Rows, Array, Array]:
+            """The tables and the evidence (some or all columns) after the reads, and the channels of the dwells."""
+            tables, log_likelihood = of_tags
+
+            def updated(rows: _Rows, read: Arrivals, part: Array, goes_on: Array) -> tuple[Array, _Rows]:
+                """The evidence of a read for every segment, and the rows of its tag and antenna after it."""
+                distance_m = last_m[read.antenna] + part * increment_m[read.antenna]
+                real, imaginary = (jnp.where(goes_on, row, 0.0) for row in rows[:2])
+                moved_m = jnp.where(goes_on, distance_m - rows[2], 0.0)
+                real, imaginary = reader.moved(real, imaginary, moved_m, depth_m, read.carrier_hz)
+                concentration = reader.concentration(read.rssi_dbm, ~moving)
+                evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
+                return evidence, (real, imaginary, distance_m)
+
+            def add(carry: tuple[_Rows, Array, Array], one: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
+                tables, log_likelihood, channel = carry
+                read, part, weight = one
+                at = read.tag * num_antennas + read.antenna
+                rows = tuple(jax.lax.dynamic_index_in_dim(table, at, keepdims=False) for table in tables)
+                # Padding costs nothing. What a read computes is computed again for gradients: kept, it takes 18 MB a frame.
+                evidence, rows = jax.lax.cond(
+                    read.valid,
+                    jax.checkpoint(updated, prevent_cse=False),
+                    lambda rows, *_: (jnp.zeros_like(rows[0]), rows),
+                    rows,
+                    read,
+                    part,
+                    read.channel == channel[at],
+                )
+                own = jax.lax.dynamic_index_in_dim(log_likelihood, read.tag, keepdims=False) + weight * evidence
+                changed = zip(tables, rows, strict=True)
+                return (
+                    tuple(jax.lax.dynamic_update_index_in_dim(table, row, at, 0) for table, row in changed),
+                    jax.lax.dynamic_update_index_in_dim(log_likelihood, own, read.tag, 0),
+                    channel.at[at].set(jnp.where(read.valid, read.channel, channel[at])),
+                ), None
+
+            def add_chunk(carry: Any, chunk: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
+                some = jnp.any(chunk[0].valid)
+                return jax.lax.cond(some, lambda: jax.lax.scan(add, carry, chunk)[0], lambda: carry), None
+
+            begin = tables, log_likelihood, state.channel.reshape(-1)
+            return jax.lax.scan(add_chunk, begin, reads)[0]
+
+        def of_all() -> tuple[_Rows, Array, Array]:
+            inherited = jax.tree.map(lambda rows: _taken(rows, source), of_tags)
+            return scanned(inherited, last_m, increment_m, depth_m, moving)
+
+        def of_those(exists: Bool[Array, " segment"]) -> tuple[_Rows, Array, Array]:
+            (slots,) = jnp.nonzero(exists, size=_FEW, fill_value=shape[-1])
+            inherited = jax.tree.map(lambda rows: _taken(rows, _taken(source, slots)), of_tags)
+            columns = (_taken(rows, slots) for rows in (last_m, increment_m, depth_m, moving))
+            *changed, channel = scanned(inherited, *columns)
+            put = lambda rows, own: rows.at[:, slots].set(own, mode="drop", indices_are_sorted=True)  # noqa: E731
+            return (*jax.tree.map(put, of_tags, tuple(changed)), channel)
+
+        if exists is None or shape[-1] <= _FEW:
+            tables, log_likelihood, channel = of_all()
+        else:
+            some, exists = jnp.any(exists), exists | ~moving
+            few = some & (jnp.sum(exists, dtype=jnp.int32) <= _FEW)
+            tables, log_likelihood, channel = jax.lax.cond(few, lambda: of_those(exists), of_all)
         real, imaginary, read_m = (table.reshape(shape) for table in tables)
         distance_m = last_m + increment_m
         after = DwellState(real, imaginary, read_m, distance_m, channel.reshape(shape[:2]), log_likelihood)
         return after, log_likelihood
 
 
-def _in_chunks(values: Array) -> Array:
-    """Values of reads as (chunk, read), padded with zeros, which are no valid reads."""
-    padded = jnp.pad(values, (0, -values.shape[0] % _CHUNK))
-    return padded.reshape(-1, _CHUNK)
+def _in_chunks(reads: tuple[Arrivals, Array, Array]) -> tuple[Arrivals, Array, Array]:
+    """(chunk, _CHUNK) reads, with invalid ones at the end: a chunk of such reads costs nothing."""
+    more = -reads[0].valid.shape[0] % _CHUNK
+    return jax.tree.map(lambda leaf: jnp.pad(leaf, (0, more)).reshape(-1, _CHUNK), reads)
 
 
-def _inherit(state: DwellState, newborn_source: Int[Array, " segment"]) -> DwellState:
-    """The state with newborn segments' rows from their sources, all at once: a source may be replaced itself."""
+def _sources(newborn_source: Int[Array, " segment"]) -> Int[Array, " segment"]:
+    """The slot of the last frame that each one's rows come from, all at once: a source may be replaced itself."""
     slot = jnp.arange(newborn_source.shape[0], dtype=newborn_source.dtype)
-    source = jnp.where((newborn_source < -1) | (slot == 0), slot, jnp.maximum(newborn_source, 0))
+    return jnp.where((newborn_source < -1) | (slot == 0), slot, jnp.maximum(newborn_source, 0))
 
-    def of(rows: Float[Array, "*batch segment"]) -> Float[Array, "*batch segment"]:
-        return jnp.take(rows, source, axis=-1, mode="clip")
 
-    return DwellState(
-        real=of(state.real),
-        imaginary=of(state.imaginary),
-        read_m=of(state.read_m),
-        distance_m=of(state.distance_m),
-        channel=state.channel,
-        log_likelihood=of(state.log_likelihood),
-    )
+def _taken(rows: Shaped[Array, "*batch segment"], slots: Int[Array, " some"]) -> Shaped[Array, "*batch some"]:
+    return jnp.take(rows, slots, axis=-1, mode="clip")

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ...core.constrained import Positive
+from .travel import squared_distance
 
 _NOTHING = -1e4  # evidence of no body, nats
 
@@ -29,7 +30,7 @@ class HiddenState(eqx.Module):
     def nothing(num_tags: int) -> HiddenState:
         """No body yet."""
         zero = jnp.zeros((num_tags, 3))
-        return HiddenState(jnp.full(num_tags, _NOTHING), zero, zero, jnp.zeros(num_tags))
+        return HiddenState(jnp.full(num_tags, _NOTHING, jnp.float32), zero, zero, jnp.zeros(num_tags))
 
 
 class HiddenBody(eqx.Module):
@@ -55,7 +56,7 @@ class HiddenBody(eqx.Module):
         newborn: Bool[Array, " segment"],
     ) -> Float[Array, "tag segment"]:
         """The evidence, in which new segments near a tag's last body have its evidence where that is higher."""
-        apart_m2 = jnp.sum(jnp.square(centre_m[None] - state.centre_m[:, None]), axis=-1)
+        apart_m2 = squared_distance(state.centre_m, centre_m)
         reach_m2 = jnp.square(self.reach_m.value + self.drift_m_s.value * state.age_s)[:, None]
         near = state.evidence_nats[:, None] - 0.5 * self.margin_nats.value * apart_m2 / reach_m2
         return jnp.where(newborn[None], jnp.maximum(log_likelihood, near), log_likelihood)

@@ -189,7 +189,7 @@ class TagAttention(AbstractTracer):
         if self.dwell is not None and dwell is not None:
             dwell, log_likelihood = self.dwell.step(
                 self.reader, dwell, frame.arrivals, found.increment_m, found.centre_m[:, 2], found.source,
-                since_s, now_s,
+                since_s, now_s, found.area > 0,
             )  # fmt: skip
             if self.hidden is not None and state.hidden is not None:
                 newborn = found.source > -2

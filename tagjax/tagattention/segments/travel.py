@@ -153,8 +153,8 @@ class TravellingTogether(eqx.Module):
     def _kernel(
         self, centre_m: Float[Array, "active 3"], lagged_m: Float[Array, "active 3"]
     ) -> Float[Array, "active active"]:
-        apart = _squared_distance(centre_m, centre_m)
-        against = _squared_distance(lagged_m, lagged_m)
+        apart = squared_distance(centre_m, centre_m)
+        against = squared_distance(lagged_m, lagged_m)
         length = safe_norm(lagged_m)
         further = jnp.maximum(length[:, None], length[None])
         variance = (
@@ -177,7 +177,7 @@ class TravellingTogether(eqx.Module):
         """The sources, with the nearest mover for new segments that have none."""
         lost = jnp.where(newborn & (source <= 0), area, 0.0)
         size, at = jax.lax.top_k(jax.lax.stop_gradient(lost), min(self.num_newborn, lost.shape[0]))
-        apart = _squared_distance(centre_m[at], centre_m[active])
+        apart = squared_distance(centre_m[at], centre_m[active])
         mover = there & ~newborn[active] & (speed_m_s[active] > self.mover_m_s)
         apart = jnp.where(mover[None], apart, jnp.inf)
         found = (size > 0) & (jnp.min(apart, axis=1) < self.adopt_m**2)
@@ -185,8 +185,8 @@ class TravellingTogether(eqx.Module):
         return source.at[at].set(jnp.where(found, nearest, source[at]))
 
 
-def _squared_distance(one: Float[Array, "one 3"], other: Float[Array, "other 3"]) -> Float[Array, "one other"]:
-    """Axis by axis: XLA sums over a last axis of three several times as slowly on a CPU."""
+def squared_distance(one: Float[Array, "one 3"], other: Float[Array, "other 3"]) -> Float[Array, "one other"]:
+    """Of each point to each, m^2. Axis by axis: XLA sums over a last axis of three several times as slowly on a CPU."""
     x, y, z = (jnp.square(own[:, None] - their[None]) for own, their in zip(one.T, other.T, strict=True))
     return x + y + z
 

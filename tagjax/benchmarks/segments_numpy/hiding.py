@@ -1,0 +1,94 @@
+"""Bodies completed, and remembered while hidden: `tagattention.segments.whole` and `.hidden`, for all tags at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ...tagattention.segments import hidden, whole
+from .body import sigmoid
+from .travel import Segments, norm, squared_distance, top
+
+
+class Whole:
+    """Completes bodies that travel; see `WholeBody`."""
+
+    def __init__(self, settings: whole.WholeBody) -> None:
+        self.lag_s, self.num_active = settings.lag_s, settings.num_active
+        self.travel_m_s, self.share = (np.float32(one.value) for one in (settings.travel_m_s, settings.share))
+        self.gap = np.float32(settings.gap)
+
+    def complete(
+        self, membership: Float[np.ndarray, "tag segment"], found: Segments, moved_m: np.ndarray, elapsed_s: np.ndarray
+    ) -> None:
+        """Complete memberships (probabilities) in place."""
+        speed_m_s = norm(moved_m) / np.maximum(elapsed_s, np.float32(0.5 * self.lag_s))
+        at = top(np.where(found.exists, speed_m_s, np.float32(0)), self.num_active)
+        at = at[found.exists[at]]
+        if not len(at):
+            return
+        travels = sigmoid((speed_m_s[at] - self.travel_m_s) / (np.float32(0.2) * self.travel_m_s))
+        body = connected(found.centre_m[at], self.gap * found.size_m[at], travels > 0.5)
+        total = membership @ found.area
+        own = membership[:, at]
+        going = own * (found.area[at] * travels)
+        share = going.sum(axis=1) / np.where(total != 0, total, 1)
+        goes = sigmoid((share - self.share) / np.float32(0.1))
+        members = (body[:, None] == np.arange(len(at))[None]).astype(np.float32)
+        same = body[None] == np.argmax(going @ members, axis=1)[:, None]
+        more = np.where(same, np.float32(whole._MOST) * goes[:, None] * travels[None], np.float32(0))
+        membership[:, at] = 1 - (1 - own) * (1 - more)
+
+
+def connected(
+    centre_m: Float[np.ndarray, "active 3"], reach_m: Float[np.ndarray, " active"], member: Bool[np.ndarray, " active"]
+) -> Int[np.ndarray, " active"]:
+    """The largest index in each one's component; see `whole.connected`, whose limit on a chain's length it has."""
+    index = np.arange(len(centre_m))
+    at = np.flatnonzero(member)
+    if not len(at):
+        return index
+    limit = np.float32(0.5) * (reach_m[at][:, None] + reach_m[at][None])
+    close = squared_distance(centre_m[at], centre_m[at]) < np.square(limit)
+    close[np.diag_indices(len(at))] = True
+    own = np.arange(len(at))
+    for _ in range(whole._ROUNDS):
+        last, own = own, np.where(close, own[None], -1).max(axis=1)
+        own = own[own][own[own]]
+        if np.array_equal(last, own):
+            break
+    index[at] = at[own]
+    return index
+
+
+class Hidden:
+    """The last body of each tag; see `HiddenBody`."""
+
+    def __init__(self, settings: hidden.HiddenBody, num_tags: int) -> None:
+        names = "margin_nats", "reach_m", "drift_m_s", "stop_s"
+        self.value = {name: np.float32(getattr(settings, name).value) for name in names}
+        self.evidence_nats = np.full(num_tags, hidden._NOTHING, np.float32)
+        self.centre_m, self.velocity_m_s = np.zeros((num_tags, 3), np.float32), np.zeros((num_tags, 3), np.float32)
+        self.age_s = np.zeros(num_tags, np.float32)
+
+    def inherit(self, log_likelihood: Float[np.ndarray, "tag segment"], found: Segments) -> None:
+        """Raise the evidence of new segments near a tag's last body, in place."""
+        v, new = self.value, np.flatnonzero(found.source > -2)
+        reach_m2 = np.square(v["reach_m"] + v["drift_m_s"] * self.age_s)[:, None]
+        apart_m2 = squared_distance(self.centre_m, found.centre_m[new])
+        near = self.evidence_nats[:, None] - np.float32(0.5) * v["margin_nats"] * apart_m2 / reach_m2
+        log_likelihood[:, new] = np.maximum(log_likelihood[:, new], near)
+
+    def step(
+        self, body_nats: np.ndarray, centre_m: np.ndarray, velocity_m_s: np.ndarray, kept: np.float32, dt_s: np.float32
+    ) -> Bool[np.ndarray, " tag"]:
+        """Which tags are hidden after a frame."""
+        nothing, v = np.float32(hidden._NOTHING), self.value
+        remembered = np.where(self.evidence_nats > 0.5 * nothing, kept * self.evidence_nats, nothing)
+        hides = remembered > body_nats + v["margin_nats"]
+        gone, slowed = hides[:, None], self.velocity_m_s * np.exp(-dt_s / v["stop_s"])
+        self.evidence_nats = np.where(hides, remembered, body_nats)
+        self.centre_m = np.where(gone, self.centre_m + slowed * dt_s, centre_m)
+        self.velocity_m_s = np.where(gone, slowed, velocity_m_s)
+        self.age_s = np.where(hides, self.age_s + dt_s, np.float32(0))
+        return hides
