@@ -11,12 +11,13 @@ import jax
 import numpy as np
 import optax
 
+from ..core.machine import peak_memory_mib
 from ..flow.estimates import NetworkFlow, flow_along
 from ..flow.losses import FlowLossSettings
 from ..flow.pyramid import PyramidFlow
 from ..flow.registry import make_flow
 from ..training.flow_step import FlowTrainState, flow_step
-from .timing import Timing, first_call_s, in_separate_process, medians_ms, peak_memory_mib
+from .timing import Timing, first_call_s, in_separate_process, medians_ms
 
 _BATCH, _ROWS, _COLUMNS = 8, 128, 160
 """Pairs of a training step, and their size."""

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -81,14 +80,3 @@ def in_separate_process(code: str, what: str, *, environment: Mapping[str, str] 
     if done.returncode:
         raise RuntimeError(f"{what} failed: {done.stderr.strip()[-500:]}")
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def peak_memory_mib() -> float:
-    """The largest resident memory of this process so far."""
-    status = Path("/proc/self/status")
-    if status.exists():  # Linux counts the memory of the process that started this one in `ru_maxrss`
-        return int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**10
-    import resource  # not on every system
-
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import optax
 
+from ..core.machine import peak_memory_mib
 from ..sim.record import CaptureSettings, simulate_recording
 from ..sim.stories import build_scenario
 from ..tagattention import TagAttention
@@ -21,7 +22,7 @@ from ..tracing.clips import Clip, ClipSettings, load_clip
 from ..training.objective import ObjectiveSettings
 from ..training.state import TrainState
 from ..training.step import make_optimizer, train_step
-from .timing import Timing, in_separate_process, peak_memory_mib
+from .timing import Timing, in_separate_process
 
 LENGTHS = (12, 24, 48, 96)
 """Frames of a clip."""

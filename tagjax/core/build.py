@@ -46,8 +46,7 @@ def with_modules(called: Callable[..., Any], settings: Mapping[str, Any], *, whe
     """The settings in which each mapping that stands for a Module has become one, at any depth.
 
     The annotations of `called` say which arguments are Modules; such a mapping holds that Module's own arguments. Lists become
-    tuples. Raises
-    `ConfigError` with the dotted path for arguments that a Module does not take, or refuses.
+    tuples. Raises `ConfigError` with the dotted path for arguments that a Module does not take, or refuses.
     """
     if not _is_module(called):
         return dict(settings)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,3 +25,14 @@ def machine() -> dict[str, Any]:
         "jax": jax.__version__,
         "opencv": cv2.__version__,
     }
+
+
+def peak_memory_mib() -> float:
+    """The largest resident memory of this process so far."""
+    status = Path("/proc/self/status")
+    if status.exists():  # Linux counts the memory of the process that started this one in `ru_maxrss`
+        return int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**10
+    import resource  # not on every system
+
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

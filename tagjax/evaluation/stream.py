@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import resource
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ import jax
 import numpy as np
 
 from ..core.camera import working_stride
+from ..core.machine import peak_memory_mib
 from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..flow.registry import make_flow
@@ -123,7 +123,7 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
             "start_s": round(start_s, 2),
             "process_ms": computing.summary(),
             "latency_ms": latency.summary(),
-            "memory_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+            "memory_mib": round(peak_memory_mib()),
             "interrupted": interrupted,
         }
     write_json(folder / "stream.json", to_json_values(summary))

@@ -37,7 +37,8 @@ def frame_arrivals(
     Tags and antennas are numbered as in `epcs` and `antennas` (these counted from 1); times are seconds from `origin_ns`.
     The first frame's reads are those since `since_ns`; it has none if this is None. Where more than `num_reads` arrive,
     the newest of each tag stay, then the second newest of each tag and so on; of equal rank the newest. A missing RSSI
-    becomes `UNKNOWN_RSSI_DBM`. Raises `ValueError` for a buffer without elements, a tag or antenna given twice, and frames that are not in order of time.
+    becomes `UNKNOWN_RSSI_DBM`. Raises `ValueError` for a buffer without elements, a tag or antenna given twice,
+    and frames that are not in order of time.
     """
     if num_reads < 1:
         raise ValueError(f"num_reads is {num_reads}; expected at least 1 (length of a frame's buffer).")

@@ -150,7 +150,8 @@ def load_clip(
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
 
-    `stride` keeps every n-th pixel in both directions, None about 256 columns (`working_stride`). A motion vector has `window` frames, or as many as cover `window_s`
+    `stride` keeps every n-th pixel in both directions, None about 256 columns (`working_stride`). A motion vector has
+    `window` frames, or as many as cover `window_s`
     seconds at the recording's frame rate. Ranges are estimated causally from the recording's start, so that
     a clip in the middle uses the reads before it. The constants of the reader (probability of pi flips, slope and spread
     of the channel offsets, mean carrier: `radio_model`) are fitted to all reads of the tag. `antennas` chooses the
@@ -196,7 +197,10 @@ def load_clip(
     def stacked(parts):
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *parts)
 
-    arrivals, _ = frame_arrivals(recording.reads, tags, chosen, recording.time_ns, origin_ns, MAX_ARRIVALS)
+    since_ns = int(recording.time_ns[start - 1]) if start else None
+    arrivals, _ = frame_arrivals(
+        recording.reads, tags, chosen, recording.time_ns[start:stop], origin_ns, MAX_ARRIVALS, since_ns=since_ns
+    )
     radio, reads = jax.tree.map(jnp.asarray, stacked([stacked([radio_of(e, a) for a in chosen]) for e in tags]))
     return Clip(
         camera=Camera(
@@ -210,7 +214,7 @@ def load_clip(
             forward_px=jnp.asarray(forward),
             radio=radio,
             reads=reads,
-            arrivals=jax.tree.map(lambda leaf: jnp.asarray(leaf[start:stop]), arrivals),
+            arrivals=jax.tree.map(jnp.asarray, arrivals),
             present=jnp.ones((stop - start, len(tags)), bool),
             colour=jnp.asarray(recording.colour[start:stop]) if colour else None,
         ),

@@ -43,7 +43,7 @@ class Whole:
 def connected(
     centre_m: Float[np.ndarray, "active 3"], reach_m: Float[np.ndarray, " active"], member: Bool[np.ndarray, " active"]
 ) -> Int[np.ndarray, " active"]:
-    """The largest index in each one's component; see `whole.connected`, whose limit on a chain's length it has."""
+    """The largest index in each one's component; see `whole.connected`; chains have the same greatest length."""
     index = np.arange(len(centre_m))
     at = np.flatnonzero(member)
     if not len(at):

@@ -14,13 +14,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from ...core.machine import peak_memory_mib
 from ...flow.registry import make_flow
 from ...recording.store import open_recording
 from ...tagattention.segments import TagAttention
 from ...tagattention.segments.outline import dense_masks
 from ...tracing.clips import choose_antennas
 from ...tracing.live import LiveTracer
-from ..timing import in_separate_process, peak_memory_mib
+from ..timing import in_separate_process
 from .swing import Swing
 
 _WARM_UP = 5

@@ -19,6 +19,7 @@ from ...core.constrained import Fraction, Positive
 from ...radio.reads import RadioWindow
 from ..attention import att_corr, att_rbf, attention, centre_first
 from ..propagation import log_likelihood_ratio, radio_speed, velocity_gate
+from .cells import row_sources
 
 
 class VelocityGate(eqx.Module):
@@ -103,9 +104,7 @@ class AttentionEvidence(eqx.Module):
         `radio` is (tag, antenna, window). `newborn_source` is -2 for a segment that goes on; a newborn one inherits from
         this slot, -1 has no past and the lowest likelihood of all.
         """
-        slot = jnp.arange(newborn_source.shape[0], dtype=newborn_source.dtype)
-        source = jnp.where(newborn_source < -1, slot, jnp.maximum(newborn_source, 0))
-        new = newborn_source == -1
+        source, new = row_sources(newborn_source), newborn_source == -1
         before_m, was_known = state.distance_m[:, source], state.known[source] & ~new[:, None]
         lowest = jnp.min(state.log_likelihood, axis=1, keepdims=True)
         carried = jnp.where(new[None], lowest, state.log_likelihood[:, source])

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...core.constrained import Positive
-from ...core.numerics import safe_divide, safe_norm
+from ...core.numerics import safe_divide, safe_norm, squared_distance
 from .past_motion import PastMotion
 from .rigid import RigidMotion
-from .travel import squared_distance
 
 _TINY = 1e-9
 

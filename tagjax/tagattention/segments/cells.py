@@ -15,6 +15,15 @@ NOT_NEW = -2
 _COARSE_FROM = 1.5  # a cell is coarse where segments should be at least so many fine sides wide
 
 
+def row_sources(newborn_source: Int[Array, " segment"]) -> Int[Array, " segment"]:
+    """The slot of the last frame that each one's rows come from: its own, that of a newborn segment's source, or 0 for none.
+
+    Take all rows at once, for a source may be replaced itself.
+    """
+    slot = jnp.arange(newborn_source.shape[0], dtype=newborn_source.dtype)
+    return jnp.where((newborn_source <= NOT_NEW) | (slot == 0), slot, jnp.maximum(newborn_source, 0))
+
+
 def births(
     hole: Bool[Array, "height width"],
     side_px: Float[Array, "height width"],

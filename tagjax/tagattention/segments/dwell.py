@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from ...core.constrained import Positive
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
+from .cells import row_sources
 
 _SHORTEST_FRAME_S = 1e-6
 _CHUNK = 8  # reads: valid ones come first in a frame's buffer, which is mostly empty
@@ -82,11 +83,12 @@ class DwellEvidence(eqx.Module):
 
         `arrivals` are the reads in (since_s, now_s], in order of time; `increment_m` is what each segment's distance to
         each antenna has grown since the frame at `since_s`, linearly in time, and `depth_m` its z. `newborn_source` is -2
-        for a segment that goes on; a newborn one inherits evidence and phasors of this slot as it was at the last frame, -1 those of slot 0.
-        Cost: reads x segments, and one copy of the state for the newborn segments. Slots that do not exist may be left out
-        of the reads, because nothing but a newborn segment will be there; with `exists` None, or nowhere, all take part.
+        for a segment that goes on; a newborn one inherits evidence and phasors of this slot as it was at the last frame, -1
+        those of slot 0. Cost: reads x segments, and one copy of the state for the newborn segments. Slots that do not exist
+        may be left out of the reads, because nothing but a newborn segment will be there; with `exists` None, or nowhere,
+        all take part.
         """
-        source = _sources(newborn_source)
+        source = row_sources(newborn_source)
         moving = jnp.arange(increment_m.shape[1]) > 0
         increment_m = jnp.where(moving, increment_m, 0.0)
         last_m = _taken(state.distance_m, source)
@@ -174,12 +176,6 @@ def _in_chunks(reads: tuple[Arrivals, Array, Array]) -> tuple[Arrivals, Array, A
     """(chunk, _CHUNK) reads, with invalid ones at the end: a chunk of such reads costs nothing."""
     more = -reads[0].valid.shape[0] % _CHUNK
     return jax.tree.map(lambda leaf: jnp.pad(leaf, (0, more)).reshape(-1, _CHUNK), reads)
-
-
-def _sources(newborn_source: Int[Array, " segment"]) -> Int[Array, " segment"]:
-    """The slot of the last frame that each one's rows come from, all at once: a source may be replaced itself."""
-    slot = jnp.arange(newborn_source.shape[0], dtype=newborn_source.dtype)
-    return jnp.where((newborn_source < -1) | (slot == 0), slot, jnp.maximum(newborn_source, 0))
 
 
 def _taken(rows: Shaped[Array, "*batch segment"], slots: Int[Array, " some"]) -> Shaped[Array, "*batch some"]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ...core.constrained import Positive
-from .travel import squared_distance
+from ...core.numerics import squared_distance
 
 _NOTHING = -1e4  # evidence of no body, nats
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Positive
-from ...core.numerics import safe_norm
+from ...core.numerics import safe_norm, squared_distance
 from ...core.parameters import check_positive
 from .past_motion import PastMotion
 from .step import SegmentFrame
@@ -183,12 +183,6 @@ class TravellingTogether(eqx.Module):
         found = (size > 0) & (jnp.min(apart, axis=1) < self.adopt_m**2)
         nearest = active[jnp.argmin(apart, axis=1)].astype(source.dtype)
         return source.at[at].set(jnp.where(found, nearest, source[at]))
-
-
-def squared_distance(one: Float[Array, "one 3"], other: Float[Array, "other 3"]) -> Float[Array, "one other"]:
-    """Of each point to each, m^2. Axis by axis: XLA sums over a last axis of three several times as slowly on a CPU."""
-    x, y, z = (jnp.square(own[:, None] - their[None]) for own, their in zip(one.T, other.T, strict=True))
-    return x + y + z
 
 
 def _inherit(state: TravelState, source: Int[Array, " segment"]) -> TravelState:

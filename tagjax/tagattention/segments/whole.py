@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Fraction, Positive
-from ...core.numerics import safe_divide, safe_norm
+from ...core.numerics import safe_divide, safe_norm, squared_distance
 from ...core.parameters import check_positive
 from .step import SegmentFrame
 
@@ -102,8 +102,7 @@ def connected(
     Members are connected where their centres are closer than the mean of their reaches. Components whose diameter
     exceeds what six rounds of propagation reach (some 100 segments in a chain) may be split.
     """
-    apart_m2 = sum(jnp.square(own[:, None] - own[None]) for own in centre_m.T)
-    close = apart_m2 < jnp.square(0.5 * (reach_m[:, None] + reach_m[None]))
+    close = squared_distance(centre_m, centre_m) < jnp.square(0.5 * (reach_m[:, None] + reach_m[None]))
     close = (close & member[:, None] & member[None]) | jnp.eye(len(centre_m), dtype=bool)
     index = jnp.arange(len(centre_m), dtype=jnp.int32)
     for _ in range(_ROUNDS):
