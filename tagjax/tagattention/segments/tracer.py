@@ -19,11 +19,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Int8
 
 from ...core.constrained import named_values, with_named_values
 from ...core.numerics import safe_divide
 from ...radio.reader_model import ReaderModel
+from ...tracing.status import Status
 from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody
@@ -80,6 +81,7 @@ class Association(eqx.Module):
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
     confidence: Float[Array, " tag"]
     detected: Bool[Array, " tag"]
+    status: Int8[Array, " tag"]  # codes of `Status`
 
 
 class SegmentTrace(eqx.Module):
@@ -157,6 +159,7 @@ class TagAttention(AbstractTracer):
             step_m=tags.step_m,
             confidence=tags.confidence,
             detected=tags.detected,
+            status=tags.status,
         )
 
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
@@ -225,6 +228,10 @@ class TagAttention(AbstractTracer):
         confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
         in_view = jnp.any(membership > 0.5, axis=1)
         confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
+        detected = self.detection.detected(confidence)
+        last_nats = body_nats if hidden is None else jnp.where(hides, hidden.evidence_nats, body_nats)
+        terms = self.detection.probabilities(last_nats, log_likelihood[:, STATIC], num_reads)
+        status = self.detection.status(terms, detected, in_view, hides)
         return TagState(now_s, travel, dwell, attention, body, hidden, num_reads), Association(
             membership=membership,
             centre_m=mean(found.centre_m),
@@ -233,7 +240,8 @@ class TagAttention(AbstractTracer):
             stationary_nats=log_likelihood[:, STATIC],
             num_reads=num_reads,
             confidence=confidence,
-            detected=self.detection.detected(confidence),
+            detected=detected,
+            status=jnp.where(frame.present, status, jnp.int8(Status.UNKNOWN)),
         )
 
     def _bodies(
