@@ -31,6 +31,7 @@ from .body import BodyState, CarryingBody
 from .cut import cut_segments
 from .detection import Detection
 from .dwell import DwellEvidence, DwellState
+from .given import without_joined
 from .hidden import HiddenBody, HiddenState
 from .labels import STATIC
 from .outline import (
@@ -165,9 +166,13 @@ class TagAttention(AbstractTracer):
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
         """The next state and the output on segments, without dense masks."""
         dt_s = frame.time_s - _last_s(state.tags, frame)
-        segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, dt_s)
+        segments, found = self.segments.step(
+            camera, state.segments, frame.depth_m, frame.backward_px, dt_s, frame.objects
+        )
         tags, out = self.associate(state.tags, found, frame)
         labels = filled_labels(found.labels, frame.depth_m)
+        if frame.objects is not None:
+            labels = without_joined(labels, frame.objects, found.area.shape[0])
         num_segments, member = found.area.shape[0], out.membership > 0.5
         # A single frame's wrong depth is no motion; a deeper surface is accepted as background within two or three.
         lost = jnp.minimum(state.background_lost, found.background_lost) > CAMERA_MOVED_FRACTION
