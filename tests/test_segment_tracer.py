@@ -120,6 +120,17 @@ def test_phases_that_no_object_explains_are_no_detection(clip, phase_rad, reason
     assert float(jnp.mean(found.status[10:] == reason)) > 0.95
 
 
+def test_a_given_object_is_outlined_as_it_is_given(clip, traced):
+    """One object's segments are given: its mask is exactly that, and the other object is traced as before."""
+    labels = np.asarray(scene().truth.labels)
+    objects = jnp.asarray(np.where(labels == 1, 3, 0), jnp.int32)  # any number
+    frames = eqx.tree_at(lambda f: f.objects, clip.frames, objects, is_leaf=lambda leaf: leaf is None)
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
+    assert bool(jnp.all(found.detected[30:]))
+    np.testing.assert_array_equal(found.mask[30:, 0] > 0.5, labels[30:] == 1)
+    np.testing.assert_array_equal(found.mask[30:, 1] > 0.5, traced.mask[30:, 1] > 0.5)
+
+
 @pytest.mark.parametrize("broken", ["depth", "flow"])
 def test_a_frame_without_depth_or_flow_is_survived(clip, broken):
     if broken == "depth":
