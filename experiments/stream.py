@@ -4,7 +4,7 @@ python -m experiments.stream recording=a.zarr                            # in re
 python -m experiments.stream recording=a.zarr replay.real_time=false      # as fast as it goes, every frame
 python -m experiments.stream recording=a.zarr replay.real_time=false replay.loops=100
 
-frames.jsonl has a line a frame: time, and for each tag box, place, confidence. Ctrl-C ends the stream and keeps all lines.
+frames.jsonl has a line a frame: time, and for each tag box, place, confidence, and status: detected, or the reason why not. Ctrl-C ends the stream and keeps all lines.
 """
 
 from __future__ import annotations

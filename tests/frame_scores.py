@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tagjax.metrics.tags import FrameScores
+from tagjax.tracing.status import Status
 
 
 def frame_scores(iou: Any, *, rate_hz: float = 10.0, **columns: Any) -> FrameScores:
@@ -22,6 +23,7 @@ def frame_scores(iou: Any, *, rate_hz: float = 10.0, **columns: Any) -> FrameSco
         "identified": np.full(num, label),
         "confidence": np.ones(num),
         "detected": np.ones(num, bool),
+        "status": np.full(num, Status.DETECTED, np.int8),
         "range_error_m": np.full(num, -0.02),
         "visible": np.ones(num, bool),
         "since_motion": np.arange(num),

@@ -9,6 +9,7 @@ import pytest
 
 from tagjax.radio.arrivals import Arrivals
 from tagjax.tagattention.segments import Detection
+from tagjax.tracing.status import Status
 
 
 def arrivals(tag: list[int], time_s: list[float], valid: list[bool] | None = None) -> Arrivals:
@@ -32,6 +33,62 @@ def test_the_confidence_is_that_of_three_hypotheses():
     odds = np.exp([5.0, 1.5]), np.exp([3.0, 11.0]), np.exp([-1.0, -1.0])
     expected = odds[0] / sum(odds) * (1 - np.exp([-3.0, -50.0]))
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_the_probabilities_add_up_to_one_and_the_first_is_the_confidence():
+    detection = Detection()
+    given = jnp.array([3.0, -7.0, 300.0, -1e4]), jnp.array([1.0, 40.0, 290.0, 0.0]), jnp.array([0.5, 8.0, 1e-6, 0.0])
+    found = detection.probabilities(*given)
+    np.testing.assert_allclose(jnp.sum(found, axis=0), 1.0, rtol=1e-6)
+    np.testing.assert_array_equal(found[0], detection.confidence(*given))
+    np.testing.assert_allclose(found[3], np.exp(-np.asarray(given[2])), rtol=1e-6)
+
+
+BODY, STILL, ELSEWHERE, UNREAD = np.eye(4)
+
+
+@pytest.mark.parametrize(
+    ("probabilities", "in_view", "hidden", "expected"),
+    [
+        (0.9 * BODY + 0.1 * STILL, True, False, Status.DETECTED),
+        (0.4 * BODY + 0.35 * UNREAD + 0.25 * STILL, True, False, Status.NOT_READ),
+        (0.4 * BODY + 0.25 * UNREAD + 0.35 * STILL, True, False, Status.STATIONARY),
+        (0.4 * BODY + 0.35 * ELSEWHERE + 0.25 * UNREAD, True, False, Status.NOT_FOUND),
+        (0.9 * BODY + 0.1 * STILL, True, True, Status.OCCLUDED),
+        (0.9 * BODY + 0.1 * STILL, False, True, Status.OCCLUDED),
+        (0.9 * BODY + 0.1 * STILL, False, False, Status.NOT_FOUND),
+        (0.3 * BODY + 0.7 * UNREAD, True, True, Status.NOT_READ),
+        (0.3 * BODY + 0.7 * STILL, True, True, Status.STATIONARY),
+    ],
+)
+def test_the_status_is_the_most_probable_reason(probabilities, in_view, hidden, expected):
+    detection, terms = Detection(), jnp.asarray(probabilities, jnp.float32)[:, None]
+    shown = jnp.array([in_view]), jnp.array([hidden])
+    detected = detection.detected(terms[0]) & shown[0] & ~shown[1]
+    found = detection.status(terms, detected, *shown)
+    assert found.dtype == jnp.int8
+    assert Status(int(found[0])) is expected
+
+
+def test_a_status_leaves_gradients_alone_and_is_the_same_in_a_compiled_batch():
+    detection = Detection()
+    rng = np.random.default_rng(0)
+    given = tuple(jnp.asarray(rng.uniform(*ends, (5, 3)), jnp.float32) for ends in ((-9, 9), (-9, 9), (0, 3)))
+    shown = tuple(jnp.asarray(rng.uniform(size=(5, 3)) < 0.5) for _ in range(2))
+
+    def both(body, still, reads, in_view, hidden):
+        terms = detection.probabilities(body, still, reads)
+        status = detection.status(terms, detection.detected(terms[0]) & in_view & ~hidden, in_view, hidden)
+        return jnp.sum(terms[0]), status
+
+    eager = [both(*(one[row] for one in (*given, *shown)))[1] for row in range(5)]
+    of_batch = jax.jit(jax.vmap(jax.value_and_grad(both, argnums=(0, 1, 2), has_aux=True)))
+    (_, status), gradient = of_batch(*given, *shown)
+    np.testing.assert_array_equal(status, eager)
+    assert set(np.unique(status)) >= {Status.DETECTED, Status.OCCLUDED, Status.STATIONARY}
+    alone = jax.grad(lambda *one: jnp.sum(jax.vmap(detection.confidence)(*one)), argnums=(0, 1, 2))(*given)
+    for found, expected in zip(gradient, alone, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
 
 
 def test_recent_reads_are_counted_for_their_tag():

@@ -21,12 +21,13 @@ from tagjax.core.results import to_json_values
 from tagjax.metrics.boxes import box_iou, label_box
 from tagjax.metrics.recordings import ScoreSettings, box_to_picture, evaluate_recording, mask_to_picture, score_traces
 from tagjax.recording import RecordingError
-from tagjax.report.overlay import MIN_WIDTH, _extent, _free_place
-from tagjax.report.report import score_table, summarise, write_report
+from tagjax.report.overlay import MIN_WIDTH, _extent, _free_place, draw_overlay
+from tagjax.report.report import score_table, summarise, write_frames, write_report
 from tagjax.tagattention import TagAttention
 from tagjax.tagattention.frame_trace import describe
 from tagjax.tracing.clips import ClipSettings, clip_loader
 from tagjax.tracing.recordings import _tags, trace_recording
+from tagjax.tracing.status import Status
 from tagjax.tracing.tracer import Trace, trace
 
 EPCS = list(synthetic.EPCS)
@@ -224,6 +225,8 @@ def test_report_is_complete(tmp_path: Path) -> None:
         if r["tracer"] == "blunt" and r["visible"] == r["detected"] == "1" and int(r["since_motion"]) >= 0
     ]
     assert summary["blunt"]["all"]["iou"] == pytest.approx(np.sum(by_hand) / summary["blunt"]["all"]["num_frames"])
+    # This tracer gives no reasons.
+    assert all(row["status"] == ("detected" if row["detected"] == "1" else "unknown") for row in rows)
     pictures = sorted((tmp_path / "overlays" / "synthetic" / "learned").glob("*.png"))
     assert len(pictures) == 3
     drawn = cv2.imread(str(pictures[-1]))
@@ -238,6 +241,37 @@ def test_report_is_complete(tmp_path: Path) -> None:
     assert first["frame"] == "0"
     assert int(first["num_tags"]) >= 1
     assert score_table(summary).row_count == 2
+
+
+def test_the_reason_why_a_tag_is_not_detected_is_reported_and_shown(tmp_path: Path) -> None:
+    recording = synthetic.recording(3)
+    status = jnp.array([Status.OCCLUDED, Status.DETECTED], jnp.int8)
+    trace = Trace(
+        mask=jnp.zeros((2, synthetic.HEIGHT, synthetic.WIDTH)),
+        box_px=jnp.zeros((2, 4)),
+        centre_px=jnp.zeros((2, 2)),
+        centre_m=jnp.zeros((2, 3)),
+        step_m=jnp.zeros((2, 1)),
+        confidence=jnp.ones(2),
+        detected=status == Status.DETECTED,
+        status=status,
+    )
+    result = score_traces([(number, trace) for number in range(3)], recording, EPCS)
+    write_frames(tmp_path / "frames.csv", {"one": [result]})
+    with (tmp_path / "frames.csv").open() as file:
+        found = {(row["epc"], row["status"]) for row in csv.DictReader(file)}
+    assert found == {("tag-a", "occluded"), ("tag-b", "detected")}
+
+    def drawn(status: np.ndarray | None) -> np.ndarray:
+        picture, none = np.full((240, 500, 3), 90, np.uint8), np.zeros((2, 240, 500), bool)
+        return draw_overlay(picture, ["a", "b"], none, np.zeros((2, 4)), np.ones(2), np.zeros(2, bool), status=status)
+
+    without, unknown = drawn(None), drawn(np.zeros(2, np.int8))
+    np.testing.assert_array_equal(without, unknown)
+    rows = np.flatnonzero(np.any(drawn(np.array([Status.NOT_READ, Status.UNKNOWN], np.int8)) != without, axis=(1, 2)))
+    both = np.flatnonzero(np.any(drawn(np.array([Status.NOT_READ, Status.OCCLUDED], np.int8)) != without, axis=(1, 2)))
+    assert 0 < len(rows) < len(both)
+    assert rows.max() < both.max() < 40
 
 
 def test_the_table_fits_a_terminal_of_eighty_columns() -> None:

@@ -114,6 +114,11 @@ def test_a_stream_writes_a_line_a_frame_and_a_summary(tmp_path):
     tag = lines[-1]["tags"]["tag-a"]
     assert tag["detected"]
     assert tag["confidence"] > 0.5
+    every = [one["status"] for line in lines for one in line["tags"].values()]
+    assert tag["status"] == "detected"
+    assert {status: every.count(status) for status in summary["status"]} == summary["status"]
+    assert sum(summary["status"].values()) == len(every)
+    assert summary["status"]["not_read"] > 0  # at the start
     assert len(tag["box_px"]) == 4
     assert len(tag["centre_m"]) == 3
     assert 0 < summary["process_ms"]["p50"] <= summary["process_ms"]["p99"] <= summary["process_ms"]["max"]

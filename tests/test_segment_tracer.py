@@ -20,6 +20,7 @@ from tagjax.tagattention.segments.attention import AttentionEvidence
 from tagjax.tagattention.segments.detection import Detection
 from tagjax.tracing.clips import load_clip
 from tagjax.tracing.live import LiveTracer
+from tagjax.tracing.status import Status
 from tagjax.tracing.tracer import trace
 
 CONF = Path(__file__).parents[1] / "conf/tracer/tagattention_segments.yaml"
@@ -58,6 +59,7 @@ def traced(clip):
 def test_two_objects_are_found_and_outlined(traced):
     late = slice(30, None)
     assert bool(jnp.all(traced.detected[late]))
+    np.testing.assert_array_equal(traced.status == Status.DETECTED, traced.detected)
     for tag, label in enumerate(EPCS.values()):
         x0, y0, x1, y1 = BOXES[label]
         np.testing.assert_allclose(traced.box_px[late, tag], [[2 * x0, 2 * y0, 2 * x1 + 1, 2 * y1 + 1]] * 30, atol=1.0)
@@ -83,6 +85,7 @@ def test_a_place_without_a_tag_changes_nothing_and_is_never_detected(clip, trace
     np.testing.assert_allclose(found.mask[:, :2], traced.mask, atol=1e-5)
     assert not bool(jnp.any(found.detected[:, 2]))
     assert float(jnp.max(found.confidence[:, 2])) == 0.0
+    assert bool(jnp.all(found.status[:, 2] == Status.UNKNOWN))
 
 
 def test_detections_end_with_the_reads(clip):
@@ -93,16 +96,39 @@ def test_detections_end_with_the_reads(clip):
     found = eqx.filter_jit(trace)(tracer, clip.camera, frames)
     assert bool(jnp.all(found.detected[29]))
     assert not bool(jnp.any(found.detected[-5:]))
+    assert bool(jnp.all(found.status[-5:] == Status.NOT_READ))
 
 
-@pytest.mark.parametrize("phase_rad", ["zero", "random"])
-def test_phases_that_no_object_explains_are_no_detection(clip, phase_rad):
+def test_an_object_behind_another_is_occluded_while_its_tag_is_read(clip, traced):
+    """A board comes between one object and the camera, and stays; that tag's reads go on."""
+    x0, y0, x1, y1 = (2 * edge for edge in BOXES[1])
+    depth_m = clip.frames.depth_m.at[40:, y0 - 2 : y1 + 4, x0 - 2 : x1 + 4].set(1.0)
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, eqx.tree_at(lambda f: f.depth_m, clip.frames, depth_m))
+    np.testing.assert_array_equal(found.status[:40], traced.status[:40])
+    assert bool(jnp.all(found.status[42:52, 0] == Status.OCCLUDED))
+    assert bool(jnp.all(found.detected[42:, 1]))
+
+
+@pytest.mark.parametrize(("phase_rad", "reason"), [("zero", Status.STATIONARY), ("random", Status.NOT_FOUND)])
+def test_phases_that_no_object_explains_are_no_detection(clip, phase_rad, reason):
     shape = clip.frames.arrivals.phase_rad.shape
     rng = np.random.default_rng(0)
     phases = jnp.zeros(shape) if phase_rad == "zero" else jnp.asarray(rng.uniform(0, 2 * np.pi, shape), jnp.float32)
     frames = eqx.tree_at(lambda f: f.arrivals.phase_rad, clip.frames, phases)
     found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
     assert float(jnp.mean(found.detected)) <= 0.02
+    assert float(jnp.mean(found.status[10:] == reason)) > 0.95
+
+
+def test_a_given_object_is_outlined_as_it_is_given(clip, traced):
+    """One object's segments are given: its mask is exactly that, and the other object is traced as before."""
+    labels = np.asarray(scene().truth.labels)
+    objects = jnp.asarray(np.where(labels == 1, 3, 0), jnp.int32)  # any number
+    frames = eqx.tree_at(lambda f: f.objects, clip.frames, objects, is_leaf=lambda leaf: leaf is None)
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
+    assert bool(jnp.all(found.detected[30:]))
+    np.testing.assert_array_equal(found.mask[30:, 0] > 0.5, labels[30:] == 1)
+    np.testing.assert_array_equal(found.mask[30:, 1] > 0.5, traced.mask[30:, 1] > 0.5)
 
 
 @pytest.mark.parametrize("broken", ["depth", "flow"])

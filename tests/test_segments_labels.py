@@ -11,7 +11,34 @@ from segments_scenes import ANTENNAS_M, DT_S, box_frame, pinhole, random_scene, 
 
 from tagjax.tagattention.segments import Background, Segmenter, SegmentTracker
 from tagjax.tagattention.segments.carry import on_surface
-from tagjax.tagattention.segments.cells import births
+from tagjax.tagattention.segments.cells import NO_LABEL, NOT_NEW, births
+from tagjax.tagattention.segments.given import first_given, given_slots
+
+
+def test_a_given_object_is_one_segment_with_its_own_motion() -> None:
+    camera, velocity = pinhole(48, 64, 60.0), np.array([0.5, 0.06, -0.2])
+    tracker = SegmentTracker(None, Segmenter(num_segments=512))
+    step, state = eqx.filter_jit(tracker.step), tracker.init(camera)
+    slot = first_given(512) + 4
+    for number in range(8):
+        depth, flow, mask, _ = box_frame(number * DT_S, DT_S, camera, velocity=velocity)
+        gone = number == 5
+        objects = jnp.asarray(np.where(mask & (not gone), 5, 0), jnp.int32)
+        last = state.segments.labels
+        state, frame = step(camera, state, jnp.asarray(depth), jnp.asarray(flow), scalar(DT_S), objects)
+        np.testing.assert_array_equal(frame.labels == slot, mask & (not gone))
+        assert int(frame.area[slot]) == (0 if gone else int((mask & np.asarray(on_surface(jnp.asarray(depth)))).sum()))
+        assert int(frame.source[slot]) == (NO_LABEL if number in (0, 6) else NOT_NEW)
+        if number in (0, 5, 6):
+            assert not bool(frame.known[slot])
+            continue
+        np.testing.assert_allclose(frame.motion_m[slot], velocity * DT_S, atol=2e-4)
+        # What is not given has segments of its own, which go on.
+        beside = np.asarray(last)[:, -8:]
+        assert (beside > 0).all()
+        assert (np.asarray(frame.labels)[:, -8:] == beside).mean() > 0.9
+    with pytest.raises(ValueError, match="expected 32 more slots"):
+        given_slots(jnp.zeros((4, 4), jnp.int32), 60, 28)
 
 
 @pytest.mark.parametrize(("seed", "num_segments"), [(0, 80), (1, 80), (2, 24)])

@@ -24,6 +24,7 @@ from ..tagattention.tracer_settings import make_tracer, tracer_clips
 from ..tracing.clips import choose_antennas, selected_tags
 from ..tracing.live import LiveFrame, LiveMethod, LiveTracer
 from ..tracing.replay import Replay, ReplaySettings
+from ..tracing.status import Status
 
 _BINS_MS = np.geomspace(0.01, 1e5, 1401)  # 1.2 % wide: percentiles in memory that does not grow
 
@@ -92,6 +93,7 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
     )
     start_s = live.warm_up()
     computing, latency, num_frames, num_dropped_reads, num_unused_reads = Milliseconds(), Milliseconds(), 0, 0, 0
+    statuses = {one.word: 0 for one in Status if one is not Status.UNKNOWN}
     begun, interrupted = time.monotonic(), False
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "frames.jsonl").open("w") as lines, contextlib.closing(Replay(recording, config.replay)) as replay:
@@ -108,9 +110,11 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
                 num_unused_reads += found.num_unused
                 line = _line(found, stride, recording.image_shape)
                 lines.write(json.dumps(line) + "\n")
+                for tag in line["tags"].values():
+                    statuses[tag["status"]] += 1
                 if on_frame is not None:
-                    detected = ", ".join(epc for epc, tag in line["tags"].items() if tag["detected"]) or "none"
-                    on_frame(f"frame {num_frames}: {computing.percentile(50):.0f} ms; detected: {detected}")
+                    tags = ", ".join(f"{epc} {tag['status']}" for epc, tag in line["tags"].items()) or "no tag"
+                    on_frame(f"frame {num_frames}: {computing.percentile(50):.0f} ms; {tags}")
         except KeyboardInterrupt:
             interrupted = True
         summary = {
@@ -118,6 +122,7 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
             "dropped_frames": replay.num_dropped,
             "dropped_reads": num_dropped_reads,
             "unused_reads": num_unused_reads,
+            "status": statuses,  # frames of all tags, by status
             "camera_moved": live.camera_moved,
             "frames_per_s": round(num_frames / max(time.monotonic() - begun, 1e-9), 2),
             "start_s": round(start_s, 2),
@@ -134,12 +139,13 @@ def _line(found: LiveFrame, stride: int, shape: tuple[int, int]) -> dict[str, An
     """What a frame says of every tag: boxes in pixels of the whole picture, places in the camera frame."""
     trace = found.trace
     boxes = box_to_picture(np.asarray(trace.box_px), stride, *shape)
-    confidence, detected, centre_m = (
-        np.asarray(x) for x in (trace.tags.confidence, trace.tags.detected, trace.tags.centre_m)
+    confidence, detected, status, centre_m = (
+        np.asarray(x) for x in (trace.tags.confidence, trace.tags.detected, trace.tags.status, trace.tags.centre_m)
     )
     tags = {
         epc: {
             "detected": bool(detected[place]),
+            "status": Status(int(status[place])).word,
             "confidence": round(float(confidence[place]), 3),
             "box_px": [round(float(value), 1) for value in boxes[place]] if detected[place] else None,
             "centre_m": [round(float(value), 3) for value in centre_m[place]] if detected[place] else None,

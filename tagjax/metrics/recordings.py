@@ -8,11 +8,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int8, Shaped
 
 from ..core.camera import working_stride
 from ..recording import Recording, Truth
 from ..tracing.recordings import TraceSettings, trace_recording
+from ..tracing.status import status_or_detected
 from ..tracing.tracer import AbstractSmoother, AbstractTracer, Trace
 from .boxes import box_iou, centre_error, label_box, labelled_area, touches_border
 from .locking import first_motion
@@ -62,6 +63,7 @@ class Picture:
     boxes_px: Float[np.ndarray, "tag 4"]
     confidence: Float[np.ndarray, " tag"]
     detected: Bool[np.ndarray, " tag"]
+    status: Int8[np.ndarray, " tag"]  # codes of `Status`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,6 +169,7 @@ def score_traces(
         boxes = box_to_picture(np.asarray(trace.box_px), stride, height, width)
         found_boxes.append(boxes)
         detected.append(np.asarray(trace.detected, bool))
+        status = status_or_detected(trace.status, detected[-1])
         masks = {
             tag: mask_to_picture(np.asarray(trace.mask[tag]), stride, height, width) >= settings.mask_level
             for tag, epc in enumerate(names)
@@ -181,13 +184,14 @@ def score_traces(
                 row = _score_frame(masks[tag], boxes[tag], labels, scored[epc], area_px, settings)
                 row["confidence"] = float(trace.confidence[tag])
                 row["detected"] = bool(trace.detected[tag])
+                row["status"] = int(status[tag])
                 range_m = np.linalg.norm(np.asarray(trace.centre_m[tag], np.float64) - recording.antennas_m[0])
                 row["range_error_m"] = float(range_m - _at(truth.tag_range_m, epc, number))
                 rows[epc].append(row)
         if number in kept:
             confidence = np.asarray(trace.confidence, np.float64)
             ordered = np.stack([masks[tag] for tag in range(len(names))])
-            pictures.append(Picture(number, tuple(names), ordered, boxes, confidence, detected[-1]))
+            pictures.append(Picture(number, tuple(names), ordered, boxes, confidence, detected[-1], status))
         if on_frame is not None:
             on_frame()
     if truth is None or not scored:
@@ -255,6 +259,7 @@ def _tag_frames(
         identified=np.array([row["identified"] for row in rows], dtype=np.int64),
         confidence=np.array([row["confidence"] for row in rows], dtype=np.float64),
         detected=np.array([row["detected"] for row in rows], dtype=bool),
+        status=np.array([row["status"] for row in rows], dtype=np.int8),
         visible=visible,
         since_motion=since[part],
         selected=((elapsed_s >= settings.from_s - 1e-9) & (elapsed_s < until_s))[part],

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8
 
 from .boxes import PRECISION_PX, success_area
 from .identification import WINDOWS_S, window_identification
@@ -40,6 +40,7 @@ class FrameScores:
     identified: Int[np.ndarray, " time"]  # the label most covered by the mask, 0 = none
     confidence: Float[np.ndarray, " time"]
     detected: Bool[np.ndarray, " time"]  # the tracer reports a detection
+    status: Int8[np.ndarray, " time"]  # codes of `Status`: detected, or why not
     range_error_m: Float[np.ndarray, " time"]  # estimated less true range to the first antenna, NaN = unknown
     visible: Bool[np.ndarray, " time"]  # the whole object is visible in the truth
     since_motion: Int[

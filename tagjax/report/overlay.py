@@ -6,7 +6,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Int8, Shaped, UInt8
+
+from ..tracing.status import Status
 
 PALETTE_RGB = (
     (255, 99, 71),
@@ -38,10 +40,14 @@ def draw_overlay(
     confidence: Float[np.ndarray, " tag"],
     detected: Bool[np.ndarray, " tag"],
     *,
+    status: Int8[np.ndarray, " tag"] | None = None,
     true_boxes_px: Shaped[np.ndarray, "tag 4"] | None = None,
     caption: str = "",
 ) -> UInt8[np.ndarray, "picture_height picture_width 3"]:
-    """RGB picture with the tint, outline, box, name and confidence of each detected object; true boxes thin and white."""
+    """RGB picture with the tint, outline, box, name and confidence of each detected object; true boxes thin and white.
+
+    Tags that are not detected, and of which `status` gives the reason, are listed from the upper left corner down.
+    """
     scale = -(-MIN_WIDTH // colour.shape[1])
     picture = np.ascontiguousarray(colour.repeat(scale, axis=0).repeat(scale, axis=1))
     masks = masks.repeat(scale, axis=1).repeat(scale, axis=2)
@@ -68,11 +74,22 @@ def draw_overlay(
         place = 6, picture.shape[0] - 8
         _text(picture, caption, place, (255, 255, 255))
         taken.append(_extent(caption, place))
+    lines = range(_LINE, picture.shape[0] - 2 * _LINE, _LINE)  # as many as there is room for above the caption
+    for y, (tag, text) in zip(lines, _missing(names, status), strict=False):
+        _text(picture, text, (6, y), PALETTE_RGB[tag % len(PALETTE_RGB)])
+        taken.append(_extent(text, (6, y)))
     for text, box, shade in labels:
         place = _free_place(text, box, taken, picture.shape[:2])
         _text(picture, text, place, shade)
         taken.append(_extent(text, place))
     return picture
+
+
+def _missing(names: Sequence[str], status: Int8[np.ndarray, " tag"] | None) -> list[tuple[int, str]]:
+    """The tags that are not detected, with the line that says why."""
+    known = [] if status is None else [Status(code) for code in status.tolist()]
+    shown = set(Status) - {Status.DETECTED, Status.UNKNOWN}
+    return [(tag, f"{names[tag]}: {one.text}") for tag, one in enumerate(known) if one in shown]
 
 
 def _extent(text: str, place: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -19,6 +19,7 @@ from ..metrics.interval import estimates
 from ..metrics.recordings import RecordingResult
 from ..metrics.tags import Scores
 from ..recording.image_files import write_image
+from ..tracing.status import Status
 from .overlay import draw_overlay, short_name
 
 Results = Mapping[str, Sequence[RecordingResult]]
@@ -31,6 +32,7 @@ _COLUMNS = (
     "identified",
     "confidence",
     "detected",
+    "status",
     "visible",
     "since_motion",
     "reads",
@@ -82,13 +84,18 @@ def _frame_rows(results: Results) -> Iterator[tuple[Any, ...]]:
             for epc, frames in one.frames.items():
                 offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
                 for index, time_s in enumerate(frames.time_s):
-                    values = [getattr(frames, column)[index] for column in _COLUMNS]
-                    written = [int(v) if isinstance(v, np.bool_ | np.integer) else f"{v:.6g}" for v in values]
+                    written = [_written(column, getattr(frames, column)[index]) for column in _COLUMNS]
                     yield (tracer, name, epc, frames.label, offset + index, f"{time_s:.4f}", *written)
 
 
+def _written(column: str, value: Any) -> str | int:
+    if column == "status":
+        return Status(int(value)).word
+    return int(value) if isinstance(value, np.bool_ | np.integer) else f"{value:.6g}"
+
+
 def write_overlays(folder: Path, result: RecordingResult) -> None:
-    """One PNG for each kept frame; true boxes are thin and white."""
+    """One PNG for each kept frame; true boxes are thin and white. Tags that are not detected are listed with the reason."""
     truth = result.recording.truth
     for picture in result.pictures:
         true_boxes = np.full((len(picture.epcs), 4), np.nan)
@@ -104,6 +111,7 @@ def write_overlays(folder: Path, result: RecordingResult) -> None:
             picture.boxes_px,
             picture.confidence,
             picture.detected,
+            status=picture.status,
             true_boxes_px=true_boxes,
             caption=f"frame {picture.frame}",
         )

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, Int8, UInt8
 
 from ..core.numerics import safe_norm
 from ..radio.arrivals import Arrivals
@@ -82,6 +82,7 @@ class Trace(eqx.Module):
     step_m: Float[Array, "*time tag antenna"]  # change of the object's range to each antenna since the last frame
     confidence: Float[Array, "*time tag"]  # 0 to 1
     detected: Bool[Array, "*time tag"]  # the confidence exceeds the detection threshold
+    status: Int8[Array, "*time tag"] | None = None  # codes of `Status`; None: the tracer gives no reasons
 
 
 class AbstractTracer(eqx.Module):

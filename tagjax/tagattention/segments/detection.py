@@ -8,7 +8,9 @@ two against the first,
     p = exp(E_b / T) / (exp(E_b / T) + exp(E_s / T + c_s) + exp(c_e)) .
 
 What was read seconds ago says little of where the tag is now. With n reads, each counted as exp(-age / fresh_s), at least
-one of them is recent with probability 1 - exp(-n). The confidence is the product of the two.
+one of them is recent with probability 1 - exp(-n). The confidence is the product of the two. So it adds up to 1 with the
+probabilities that the tag is stationary, that it is elsewhere, and that no read is recent; the largest of these is the reason
+why a tag is not detected (`status`). Where the last body is out of view, E_b is its evidence.
 """
 
 from __future__ import annotations
@@ -16,10 +18,11 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int8
 
 from ...core.constrained import Positive
 from ...radio.arrivals import Arrivals
+from ...tracing.status import Status
 
 
 class Detection(eqx.Module):
@@ -66,12 +69,45 @@ class Detection(eqx.Module):
         num_reads: Float[Array, " tag"],
     ) -> Float[Array, " tag"]:
         """The probability that each tag is on its body, from the evidence for the hypotheses and the recent reads."""
+        return self.probabilities(body_nats, stationary_nats, num_reads)[0]
+
+    def probabilities(
+        self,
+        body_nats: Float[Array, " tag"],
+        stationary_nats: Float[Array, " tag"],
+        num_reads: Float[Array, " tag"],
+    ) -> Float[Array, "4 tag"]:
+        """The probabilities that each tag is on its body, stationary, elsewhere, and that none of its reads is recent."""
         temperature_nats = self.temperature_nats.value
         stationary = stationary_nats / temperature_nats + self.stationary
         elsewhere = jnp.broadcast_to(self.elsewhere, stationary.shape)
         level = jnp.stack([body_nats / temperature_nats, stationary, elsewhere])
-        return jax.nn.softmax(level, axis=0)[0] * -jnp.expm1(-num_reads)
+        explained = jax.nn.softmax(level, axis=0) * -jnp.expm1(-num_reads)[None]
+        return jnp.concatenate([explained, jnp.exp(-num_reads)[None]])
 
     def detected(self, confidence: Float[Array, " tag"]) -> Bool[Array, " tag"]:
         """Whether the confidence exceeds the threshold."""
         return confidence > self.threshold
+
+    def status(
+        self,
+        probabilities: Float[Array, "4 tag"],
+        detected: Bool[Array, " tag"],
+        in_view: Bool[Array, " tag"],
+        hidden: Bool[Array, " tag"],
+    ) -> Int8[Array, " tag"]:
+        """`Status.DETECTED`, or the most probable reason against it; no gradient.
+
+        `probabilities` are those of the method of this name, with the evidence of the last body where that is `hidden`.
+        `in_view` is whether some segment probably belongs to the body: without one, and not hidden, it is not found.
+        """
+        body, stationary, elsewhere, unread = probabilities
+        reasons = {
+            Status.NOT_READ: unread,
+            Status.OCCLUDED: jnp.where(hidden, body, 0.0),
+            Status.STATIONARY: stationary,
+            Status.NOT_FOUND: elsewhere + jnp.where(in_view | hidden, 0.0, body),
+        }
+        codes = jnp.asarray(list(reasons), jnp.int8)
+        reason = codes[jnp.argmax(jnp.stack(list(reasons.values())), axis=0)]
+        return jnp.where(detected, jnp.int8(Status.DETECTED), reason)

@@ -19,6 +19,7 @@ from ...image.warp import pixel_grid
 from .background import BackgroundView
 from .carry import carried_labels, next_dither
 from .cells import NO_LABEL, NOT_NEW, births
+from .given import first_given, given_slots, sources_with_given
 
 STATIC = 0
 """The slot of the static background."""
@@ -155,11 +156,13 @@ class Segmenter(eqx.Module):
         background: BackgroundView,
         dt_s: Float[Array, ""],
         focal_px: Float[Array, ""],
+        objects: Int[Array, "height width"] | None = None,
     ) -> tuple[SegmentState, Labelling]:
         """The segments of the next frame, `dt_s` later. `valid` as from `on_surface`, `background` of this frame.
 
         Displacements are those of the last frame, 0 for new segments; `displaced` adds this frame's motion.
         Where no pixel had a label, as at the first frame, everything that is not static is cut into coarse blocks.
+        Each of the given `objects` (`Frame.objects`) is one segment (see `given`), and no other has pixels of it.
         """
         rays, depth_m, backward_px = jax.lax.stop_gradient((rays, depth_m, backward_px))
         background, dt_s, focal_px = jax.lax.stop_gradient((background, dt_s, focal_px))
@@ -176,6 +179,14 @@ class Segmenter(eqx.Module):
         foreground = valid & ~static
         first = ~jnp.any(state.labels >= 0)
         kept = jnp.where(static | (carried == STATIC), NO_LABEL, carried)
+        slots = jnp.arange(self.num_segments)
+        may_be_free, given = slots != STATIC, jnp.zeros((), jnp.int32)
+        if objects is not None:
+            side_px = self.start_side(height, width)
+            given = given_slots(objects, self.num_segments, -(-height // side_px) * -(-width // side_px))
+            foreground = foreground & (given < 0)
+            kept = jnp.where((given >= 0) | (kept >= first_given(self.num_segments)), NO_LABEL, kept)
+            may_be_free = may_be_free & (slots < first_given(self.num_segments))
         labels = jax.lax.cond(
             first,
             lambda: self._started(feature, foreground),
@@ -184,7 +195,7 @@ class Segmenter(eqx.Module):
         one = jnp.ones_like(depth_m)
         (number,) = slot_sums([one], labels > 0, labels, self.num_segments)
         small = number < max(self.min_pixels, 1)
-        free = small & (jnp.arange(self.num_segments) != STATIC)
+        free = small & may_be_free
         labels = jnp.where((labels > 0) & ~small[jnp.maximum(labels, 0)], labels, NO_LABEL)
 
         hole = foreground & (labels < 0) & ~first
@@ -193,14 +204,20 @@ class Segmenter(eqx.Module):
         )
         labels = jnp.where(new > 0, new, labels)
         # Of the first frame's segments nothing is known of where they come from.
-        source = jnp.where(first & ~free & (jnp.arange(self.num_segments) != STATIC), NO_LABEL, source)
+        source = jnp.where(first & ~free & (slots != STATIC), NO_LABEL, source)
         is_new = source > NOT_NEW
         follows = (labels == kept) | (is_new[jnp.maximum(labels, 0)] & (carried >= 0))
         counted = (labels > 0) & follows
         labels = jnp.where(valid & static, STATIC, labels)
+        if objects is not None:
+            labels = jnp.where(given >= 0, given, labels)
+            counted = jnp.where(given >= 0, valid & (given == carried), counted)
+            (number,) = slot_sums([one], valid & (given >= 0), given, self.num_segments)
+            source = sources_with_given(source, number > 0, state.area > 0)
+            is_new = source > NOT_NEW
 
         points = [rays[..., axis] * depth_m for axis in range(3)]
-        area, *summed = slot_sums([one, *points], labels >= 0, labels, self.num_segments)
+        area, *summed = slot_sums([one, *points], valid & (labels >= 0), labels, self.num_segments)
         centre = jnp.stack(summed, axis=-1) / jnp.maximum(area, 1.0)[:, None]
         lives = (area > 0) & ~is_new
         after = SegmentState(

@@ -64,12 +64,13 @@ class SegmentTracker(eqx.Module):
         depth_m: Float[Array, "height width"],
         backward_px: Float[Array, "height width 2"],
         dt_s: Float[Array, ""],
+        objects: Int[Array, "height width"] | None = None,
     ) -> tuple[SegmentTrackerState, SegmentFrame]:
         """The next frame, `dt_s` after the last; `depth_m` is z, 0 = missing.
 
         `backward_px` lies on the pixels of this frame and points to the last one; where it is not finite it counts as 0. A
         frame without depth has no labels, and leaves the segments as they are. Only `increment_m` and `motion_m` have
-        gradients, in depth and flow.
+        gradients, in depth and flow. Given `objects` are segments in place of its own (`Frame.objects`).
         """
         backward_px = jnp.where(jnp.isfinite(backward_px), backward_px, 0.0)
         valid, focal = on_surface(depth_m), focal_px(camera)
@@ -77,7 +78,7 @@ class SegmentTracker(eqx.Module):
         if self.background is not None and state.background is not None:
             background, view = self.background.step(state.background, depth_m, valid, backward_px, dt_s, focal)
         segments, found = self.segmenter.step(
-            state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal
+            state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal, objects
         )
         labels, counted = stored((segments.labels, found.counted))
         motion = segment_motion(

@@ -19,17 +19,19 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Int8
 
 from ...core.constrained import named_values, with_named_values
 from ...core.numerics import safe_divide
 from ...radio.reader_model import ReaderModel
+from ...tracing.status import Status
 from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody
 from .cut import cut_segments
 from .detection import Detection
 from .dwell import DwellEvidence, DwellState
+from .given import without_joined
 from .hidden import HiddenBody, HiddenState
 from .labels import STATIC
 from .outline import (
@@ -80,6 +82,7 @@ class Association(eqx.Module):
     num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
     confidence: Float[Array, " tag"]
     detected: Bool[Array, " tag"]
+    status: Int8[Array, " tag"]  # codes of `Status`
 
 
 class SegmentTrace(eqx.Module):
@@ -157,14 +160,19 @@ class TagAttention(AbstractTracer):
             step_m=tags.step_m,
             confidence=tags.confidence,
             detected=tags.detected,
+            status=tags.status,
         )
 
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
         """The next state and the output on segments, without dense masks."""
         dt_s = frame.time_s - _last_s(state.tags, frame)
-        segments, found = self.segments.step(camera, state.segments, frame.depth_m, frame.backward_px, dt_s)
+        segments, found = self.segments.step(
+            camera, state.segments, frame.depth_m, frame.backward_px, dt_s, frame.objects
+        )
         tags, out = self.associate(state.tags, found, frame)
         labels = filled_labels(found.labels, frame.depth_m)
+        if frame.objects is not None:
+            labels = without_joined(labels, frame.objects, found.area.shape[0])
         num_segments, member = found.area.shape[0], out.membership > 0.5
         # A single frame's wrong depth is no motion; a deeper surface is accepted as background within two or three.
         lost = jnp.minimum(state.background_lost, found.background_lost) > CAMERA_MOVED_FRACTION
@@ -225,6 +233,10 @@ class TagAttention(AbstractTracer):
         confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
         in_view = jnp.any(membership > 0.5, axis=1)
         confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
+        detected = self.detection.detected(confidence)
+        last_nats = body_nats if hidden is None else jnp.where(hides, hidden.evidence_nats, body_nats)
+        terms = self.detection.probabilities(last_nats, log_likelihood[:, STATIC], num_reads)
+        status = self.detection.status(terms, detected, in_view, hides)
         return TagState(now_s, travel, dwell, attention, body, hidden, num_reads), Association(
             membership=membership,
             centre_m=mean(found.centre_m),
@@ -233,7 +245,8 @@ class TagAttention(AbstractTracer):
             stationary_nats=log_likelihood[:, STATIC],
             num_reads=num_reads,
             confidence=confidence,
-            detected=self.detection.detected(confidence),
+            detected=detected,
+            status=jnp.where(frame.present, status, jnp.int8(Status.UNKNOWN)),
         )
 
     def _bodies(
