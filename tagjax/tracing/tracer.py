@@ -42,6 +42,18 @@ class Camera(eqx.Module):
             self.antennas_m
         )
 
+    def pixels_of(self, points_m: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        """Pixel coordinates x, y of points in the camera frame; points at z = 0 count as 1 mm before the camera."""
+        height, width, _ = self.rays.shape
+        first, last = self.rays[0, 0], self.rays[-1, -1]
+        z = jnp.where(jnp.abs(points_m[..., 2]) < 1e-3, 1e-3, points_m[..., 2])
+
+        def along(axis: int, number: int) -> Float[Array, "*batch"]:
+            step = (last[axis] - first[axis]) / max(number - 1, 1)
+            return (points_m[..., axis] / z - first[axis]) / jnp.where(step == 0, 1.0, step)
+
+        return along(0, width), along(1, height)
+
 
 class BackwardMessage(eqx.Module):
     """Evidence from all frames after one, for every tag: the backward pass of offline (two-pass) smoothing computes it."""

@@ -79,16 +79,53 @@ class Hidden:
         near = self.evidence_nats[:, None] - np.float32(0.5) * v["margin_nats"] * apart_m2 / reach_m2
         log_likelihood[:, new] = np.maximum(log_likelihood[:, new], near)
 
-    def step(
-        self, body_nats: np.ndarray, centre_m: np.ndarray, velocity_m_s: np.ndarray, kept: np.float32, dt_s: np.float32
+    def predicted(self, dt_s: np.float32) -> tuple[np.ndarray, np.ndarray]:
+        """Place and velocity of each last body at this frame, if it is hidden."""
+        velocity_m_s = self.velocity_m_s * np.exp(-dt_s / self.value["stop_s"])
+        return self.centre_m + velocity_m_s * dt_s, velocity_m_s
+
+    def out_of_view(
+        self,
+        rays: tuple[np.ndarray, np.ndarray],
+        depth_m: Float[np.ndarray, "height width"],
+        labels: Int[np.ndarray, "height width"],
+        membership: Float[np.ndarray, "tag segment"],
+        dt_s: np.float32,
     ) -> Bool[np.ndarray, " tag"]:
-        """Which tags are hidden after a frame."""
+        """Whether the camera does not see the place of each last body."""
+        place_m, _ = self.predicted(dt_s)
+        out = np.ones(len(place_m), bool)
+        for tag in np.flatnonzero(place_m[:, 2] > hidden._NEAREST_M):
+            ray = place_m[tag, :2] / place_m[tag, 2]
+            limits = ((ray[0], rays[0][0, 0], rays[0][0, -1]), (ray[1], rays[1][0, 0], rays[1][-1, 0]))
+            at = [
+                (one - first) / (last - first) * (size - 1) if last != first else 0.0
+                for (one, first, last), size in zip(limits, depth_m.shape[::-1], strict=True)
+            ]
+            column, row = (round(float(one)) for one in at)
+            if 0 <= column < depth_m.shape[1] and 0 <= row < depth_m.shape[0]:
+                seen_m, slot = depth_m[row, column], labels[row, column]
+                in_front = 0 < seen_m < place_m[tag, 2] - np.float32(hidden._IN_FRONT_M)
+                out[tag] = in_front and not (slot >= 0 and membership[tag, slot] > 0.5)
+        return out
+
+    def step(
+        self,
+        body_nats: np.ndarray,
+        in_view: np.ndarray,
+        centre_m: np.ndarray,
+        velocity_m_s: np.ndarray,
+        kept: np.float32,
+        dt_s: np.float32,
+    ) -> Bool[np.ndarray, " tag"]:
+        """Which last bodies are remembered after a frame."""
         nothing, v = np.float32(hidden._NOTHING), self.value
+        body_nats = np.where(in_view, body_nats, nothing)
         remembered = np.where(self.evidence_nats > 0.5 * nothing, kept * self.evidence_nats, nothing)
-        hides = remembered > body_nats + v["margin_nats"]
-        gone, slowed = hides[:, None], self.velocity_m_s * np.exp(-dt_s / v["stop_s"])
-        self.evidence_nats = np.where(hides, remembered, body_nats)
-        self.centre_m = np.where(gone, self.centre_m + slowed * dt_s, centre_m)
-        self.velocity_m_s = np.where(gone, slowed, velocity_m_s)
-        self.age_s = np.where(hides, self.age_s + dt_s, np.float32(0))
-        return hides
+        kept_on = remembered > body_nats + v["margin_nats"]
+        gone, (place_m, slowed_m_s) = kept_on[:, None], self.predicted(dt_s)
+        self.evidence_nats = np.where(kept_on, remembered, body_nats)
+        self.centre_m = np.where(gone, place_m, centre_m)
+        self.velocity_m_s = np.where(gone, slowed_m_s, velocity_m_s)
+        self.age_s = np.where(kept_on, self.age_s + dt_s, np.float32(0))
+        return kept_on

@@ -80,14 +80,15 @@ class Dwells:
         since_s: np.float32,
         now_s: np.float32,
         exists: Bool[np.ndarray, " segment"],
-    ) -> Float[np.ndarray, "tag segment"]:
-        """The evidence after a frame, nats: the state's own array."""
+    ) -> tuple[Float[np.ndarray, "tag segment"], Float[np.ndarray, "tag segment"]]:
+        """The evidence after a frame, nats (the state's own array), and what its reads have added."""
         new = np.flatnonzero(source > -2)
         new = new[new > 0]
         old = np.maximum(source[new], 0)
         for table in (self.phasor, self.read_m, self.distance_m, self.log_likelihood):
             table[..., new] = table[..., old]
         self.log_likelihood *= np.exp(-(now_s - since_s) / self.memory_s)
+        before = self.log_likelihood.copy()
         increment_m = increment_m.copy()
         increment_m[:, 0] = 0
         # A frame without depth shows no segment, but they are there.
@@ -95,7 +96,7 @@ class Dwells:
         for at in _rounds(arrivals["tag"], arrivals["valid"]):
             self._add(at, slots, arrivals, increment_m, depth_m, since_s, now_s)
         self.distance_m += increment_m
-        return self.log_likelihood
+        return self.log_likelihood, self.log_likelihood - before
 
     def _add(
         self,
@@ -147,18 +148,22 @@ class Confidence:
         self.temperature_nats, self.fresh_s = (
             np.float32(one.value) for one in (settings.temperature_nats, settings.fresh_s)
         )
-        self.odds = np.array([0, settings.stationary, settings.elsewhere], np.float32)
+        self.stationary, self.elsewhere = np.float32(settings.stationary), np.float32(settings.elsewhere)
         self.threshold, self.num_reads = np.float32(settings.threshold), np.zeros(num_tags, np.float32)
+        self.recent_nats = np.zeros(num_tags, np.float32)
 
-    def received(self, arrivals: Reads, since_s: np.float32, now_s: np.float32) -> None:
-        """Count a frame's reads."""
+    def received(self, arrivals: Reads, added_nats: np.ndarray, since_s: np.float32, now_s: np.float32) -> None:
+        """Count a frame's reads, and what they add to the evidence for each tag's body."""
         fresh = np.exp(-np.maximum(now_s - arrivals["time_s"], 0) / self.fresh_s)
         new = np.bincount(arrivals["tag"], np.where(arrivals["valid"], fresh, 0), len(self.num_reads))
-        self.num_reads = self.num_reads * np.exp(-(now_s - since_s) / self.fresh_s) + new.astype(np.float32)
+        kept = np.exp(-(now_s - since_s) / self.fresh_s)
+        self.num_reads = self.num_reads * kept + new.astype(np.float32)
+        self.recent_nats = self.recent_nats * kept + added_nats
 
     def of(self, body_nats: Float[np.ndarray, " tag"], stationary_nats: Float[np.ndarray, " tag"]) -> np.ndarray:
         """The confidence of each tag."""
-        levels = np.stack([body_nats, stationary_nats, np.zeros_like(body_nats)]) / self.temperature_nats
-        levels += self.odds[:, None]
+        stationary = (stationary_nats - body_nats) / self.temperature_nats + self.stationary
+        elsewhere = self.elsewhere - self.recent_nats / self.temperature_nats
+        levels = np.stack([np.zeros_like(stationary), stationary, elsewhere])
         weight = np.exp(levels - levels.max(axis=0))
         return weight[0] / weight.sum(axis=0) * -np.expm1(-self.num_reads)

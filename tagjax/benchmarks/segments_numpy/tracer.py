@@ -72,7 +72,7 @@ class NumpyTracer:
         since_s = now_s if self.time_s is None else self.time_s
         depth_m, present = np.asarray(frame.depth_m), np.asarray(frame.present)
         found, labels = self.pixels(depth_m, np.asarray(frame.backward_px), now_s - since_s)
-        membership, confidence = self.associate(found, frame, present, since_s, now_s)
+        membership, confidence = self.associate(found, labels, frame, present, since_s, now_s)
         self.time_s = now_s
         filled = filled_labels(labels, depth_m)
         box_px, centre_px = boxes_and_centroids(filled, membership > 0.5)
@@ -114,14 +114,20 @@ class NumpyTracer:
         ), labels
 
     def associate(
-        self, found: Segments, frame: Frame, present: Bool[np.ndarray, " tag"], since_s: np.float32, now_s: np.float32
+        self,
+        found: Segments,
+        labels: Int[np.ndarray, "height width"],
+        frame: Frame,
+        present: Bool[np.ndarray, " tag"],
+        since_s: np.float32,
+        now_s: np.float32,
     ) -> tuple[Float[np.ndarray, "tag segment"], Float[np.ndarray, " tag"]]:
         """Each tag's membership of segments and its confidence."""
         assert frame.arrivals is not None
         dt_s = now_s - since_s
         pooling = None if self.travel is None else self.travel.step(found, dt_s, now_s)
         arrivals = {name: np.asarray(values) for name, values in vars(frame.arrivals).items()}
-        nats = self.dwells.step(
+        nats, added = self.dwells.step(
             arrivals, found.increment_m, found.centre_m[:, 2], found.source, since_s, now_s, found.exists
         )
         if self.hidden is not None:
@@ -139,14 +145,17 @@ class NumpyTracer:
         divisor = np.where(total > 0, total, np.float32(1))[:, None]
         at_place = membership * place
         mass = at_place.sum(axis=1)
-        body_nats = np.einsum("ts,ts->t", at_place, nats) / np.where(mass > 0, mass, np.float32(1))
-        body_nats = np.where((total > 0) & (mass > 0), body_nats, np.float32(-1e4))
+        some = (total > 0) & (mass > 0)
+        share = at_place / np.where(some, mass, np.float32(1))[:, None]
+        body_nats, added_nats = (np.einsum("ts,ts->t", share, one) for one in (nats, added))
         hides = np.zeros(len(total), bool)
         if self.hidden is not None:
             centre_m, motion_m = weight @ found.centre_m / divisor, weight @ found.motion_m / divisor
             kept = np.exp(-dt_s / self.dwells.memory_s)
-            hides = self.hidden.step(body_nats, centre_m, motion_m / max(dt_s, np.float32(1e-3)), kept, dt_s)
-        self.confidence.received(arrivals, since_s, now_s)
+            hides = self.hidden.out_of_view(self.rays, np.asarray(frame.depth_m), labels, membership, dt_s)
+            velocity_m_s = motion_m / max(dt_s, np.float32(1e-3))
+            hides &= self.hidden.step(body_nats, some, centre_m, velocity_m_s, kept, dt_s)
+        self.confidence.received(arrivals, added_nats, since_s, now_s)
         confidence = self.confidence.of(body_nats, nats[:, STATIC])
         shown = present & (membership > 0.5).any(axis=1) & ~hides
         return membership, np.where(shown, confidence, np.float32(0))

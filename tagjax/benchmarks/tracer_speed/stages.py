@@ -40,9 +40,9 @@ def _pixels(inputs: tuple[TagAttention, Camera, Frame, Any], state: Any) -> Any:
 
 
 @eqx.filter_jit(donate="all-except-first")
-def _tags(inputs: tuple[TagAttention, Any, Frame], state: Any) -> Any:
-    tracer, found, frame = inputs
-    return tracer.associate(state, found, frame)
+def _tags(inputs: tuple[TagAttention, Camera, Any, Frame], state: Any) -> Any:
+    tracer, camera, found, frame = inputs
+    return tracer.associate(camera, state, found, frame)
 
 
 @eqx.filter_jit
@@ -126,7 +126,8 @@ def part_times_ms(camera: Camera, frames: list[Frame]) -> dict[str, float]:
     for frame in frames:
         inputs = tracer, camera, frame, frame.time_s - last_s
         pixels, found = timed("pixel side", lambda inputs=inputs, state=pixels: _pixels(inputs, state))
-        tags, out = timed("per-tag side", lambda f=found, frame=frame, state=tags: _tags((tracer, f, frame), state))
+        given = tracer, camera, found, frame
+        tags, out = timed("per-tag side", lambda given=given, state=tags: _tags(given, state))
         given = found.labels, frame.depth_m, out.membership
         labels, _ = timed("boxes", lambda given=given: _boxes(*given))
         timed("dense masks", lambda labels=labels, out=out: masks(labels, out.membership))

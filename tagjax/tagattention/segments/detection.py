@@ -1,16 +1,14 @@
 """Detection: the probability that a tag is on the body that its mask shows.
 
 Three hypotheses explain the reads of the last seconds: the tag moves with its body (log likelihood ratio E_b to phases at
-random), it is stationary (E_s), or it is elsewhere, hidden or on something that is not followed, and its phases are at
-random (0). With a temperature T, as errors of a motion are common to many reads, and prior log odds c_s and c_e of the last
-two against the first,
+random), it is stationary (E_s), or it was on the body and has left it of late: it is elsewhere, hidden or on something that
+is not followed, and the phases of recent reads are at random (E_b - R, where R is what these add to E_b). With a temperature
+T, as errors of a motion are common to many reads, and prior log odds c_s and c_e of the last two against the first,
 
-    p = exp(E_b / T) / (exp(E_b / T) + exp(E_s / T + c_s) + exp(c_e)) .
+    p = exp(E_b / T) / (exp(E_b / T) + exp(E_s / T + c_s) + exp((E_b - R) / T + c_e)) .
 
-What was read seconds ago says little of where the tag is now. With n reads, each counted as exp(-age / fresh_s), at least
-one of them is recent with probability 1 - exp(-n). The confidence is the product of the two. So it adds up to 1 with the
-probabilities that the tag is stationary, that it is elsewhere, and that no read is recent; the largest of these is the reason
-why a tag is not detected (`status`). Where the last body is out of view, E_b is its evidence.
+What was read seconds ago says little of where the tag is now: R and the number n of recent reads count each read as
+exp(-age / fresh_s). At least one is recent with probability 1 - exp(-n). The confidence is the product of the two.
 """
 
 from __future__ import annotations
@@ -25,12 +23,26 @@ from ...radio.arrivals import Arrivals
 from ...tracing.status import Status
 
 
+class RecentReads(eqx.Module):
+    """What each tag's recent reads amount to; each counts as `Detection` says."""
+
+    number: Float[Array, " tag"]
+    nats: Float[Array, " tag"]  # evidence for the tag's body
+
+    @staticmethod
+    def nothing(num_tags: int) -> RecentReads:
+        """Before the first read."""
+        return RecentReads(jnp.zeros(num_tags), jnp.zeros(num_tags))
+
+
 class Detection(eqx.Module):
     """Stage that decides which tags are detected. `Detection()` has good values."""
 
     temperature_nats: Positive
     stationary: Float[Array, ""]  # prior log odds of a stationary tag against one on its body
-    elsewhere: Float[Array, ""]  # prior log odds of a tag that is elsewhere; low: reflections change phases that fit
+    elsewhere: Float[
+        Array, ""
+    ]  # prior log odds of a tag that has left its body; low: reflections change phases that fit
     fresh_s: Positive  # time constant of the reads' age
     threshold: float = eqx.field(static=True)  # confidence above which a tag is detected; no gradient reaches it
 
@@ -52,38 +64,34 @@ class Detection(eqx.Module):
 
     def received(
         self,
-        num_reads: Float[Array, " tag"],
+        state: RecentReads,
         arrivals: Arrivals,
+        added_nats: Float[Array, " tag"],
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
-    ) -> Float[Array, " tag"]:
-        """Each tag's number of recent reads after a frame, from that after the last frame."""
+    ) -> RecentReads:
+        """The recent reads after a frame; `added_nats` is what its reads, `arrivals`, are as evidence for each tag's body."""
         fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / self.fresh_s.value)
-        new = jax.ops.segment_sum(jnp.where(arrivals.valid, fresh, 0.0), arrivals.tag, num_reads.shape[0])
-        return num_reads * jnp.exp(-(now_s - since_s) / self.fresh_s.value) + new
+        new = jax.ops.segment_sum(jnp.where(arrivals.valid, fresh, 0.0), arrivals.tag, state.number.shape[0])
+        kept = jnp.exp(-(now_s - since_s) / self.fresh_s.value)
+        return RecentReads(number=kept * state.number + new, nats=kept * state.nats + added_nats)
 
     def confidence(
-        self,
-        body_nats: Float[Array, " tag"],
-        stationary_nats: Float[Array, " tag"],
-        num_reads: Float[Array, " tag"],
+        self, body_nats: Float[Array, " tag"], stationary_nats: Float[Array, " tag"], recent: RecentReads
     ) -> Float[Array, " tag"]:
         """The probability that each tag is on its body, from the evidence for the hypotheses and the recent reads."""
-        return self.probabilities(body_nats, stationary_nats, num_reads)[0]
+        return self.probabilities(body_nats, stationary_nats, recent)[0]
 
     def probabilities(
-        self,
-        body_nats: Float[Array, " tag"],
-        stationary_nats: Float[Array, " tag"],
-        num_reads: Float[Array, " tag"],
+        self, body_nats: Float[Array, " tag"], stationary_nats: Float[Array, " tag"], recent: RecentReads
     ) -> Float[Array, "4 tag"]:
         """The probabilities that each tag is on its body, stationary, elsewhere, and that none of its reads is recent."""
         temperature_nats = self.temperature_nats.value
-        stationary = stationary_nats / temperature_nats + self.stationary
-        elsewhere = jnp.broadcast_to(self.elsewhere, stationary.shape)
-        level = jnp.stack([body_nats / temperature_nats, stationary, elsewhere])
-        explained = jax.nn.softmax(level, axis=0) * -jnp.expm1(-num_reads)[None]
-        return jnp.concatenate([explained, jnp.exp(-num_reads)[None]])
+        stationary = (stationary_nats - body_nats) / temperature_nats + self.stationary
+        elsewhere = self.elsewhere - recent.nats / temperature_nats
+        level = jnp.stack([jnp.zeros_like(stationary), stationary, elsewhere])
+        explained = jax.nn.softmax(level, axis=0) * -jnp.expm1(-recent.number)[None]
+        return jnp.concatenate([explained, jnp.exp(-recent.number)[None]])
 
     def detected(self, confidence: Float[Array, " tag"]) -> Bool[Array, " tag"]:
         """Whether the confidence exceeds the threshold."""
@@ -99,14 +107,15 @@ class Detection(eqx.Module):
         """`Status.DETECTED`, or the most probable reason against it; no gradient.
 
         `probabilities` are those of the method of this name, with the evidence of the last body where that is `hidden`.
-        `in_view` is whether some segment probably belongs to the body: without one, and not hidden, it is not found.
+        `in_view` is whether some segment probably belongs to the body: without one, and not hidden, it is not found. A tag
+        that is elsewhere is occluded if its last body is hidden: so it is known where.
         """
         body, stationary, elsewhere, unread = probabilities
         reasons = {
             Status.NOT_READ: unread,
-            Status.OCCLUDED: jnp.where(hidden, body, 0.0),
+            Status.OCCLUDED: jnp.where(hidden, body + elsewhere, 0.0),
             Status.STATIONARY: stationary,
-            Status.NOT_FOUND: elsewhere + jnp.where(in_view | hidden, 0.0, body),
+            Status.NOT_FOUND: jnp.where(hidden, 0.0, elsewhere + jnp.where(in_view, 0.0, body)),
         }
         codes = jnp.asarray(list(reasons), jnp.int8)
         reason = codes[jnp.argmax(jnp.stack(list(reasons.values())), axis=0)]

@@ -28,8 +28,9 @@ from ...tracing.status import Status
 from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody
+from .cells import row_sources
 from .cut import cut_segments
-from .detection import Detection
+from .detection import Detection, RecentReads
 from .dwell import DwellEvidence, DwellState
 from .given import without_joined
 from .hidden import HiddenBody, HiddenState
@@ -43,7 +44,7 @@ from .outline import (
     segment_centroids,
 )
 from .step import SegmentFrame, SegmentTracker, SegmentTrackerState
-from .travel import TravellingTogether, TravelState
+from .travel import Pooling, TravellingTogether, TravelState
 from .whole import WholeBody
 
 CAMERA_MOVED_FRACTION = 0.8
@@ -59,7 +60,7 @@ class TagState(eqx.Module):
     attention: AttentionState | None
     body: BodyState | None
     hidden: HiddenState | None
-    num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
+    recent: RecentReads
 
 
 class TagAttentionState(eqx.Module):
@@ -77,9 +78,11 @@ class Association(eqx.Module):
     membership: Float[Array, "tag segment"]  # probability that a segment belongs to the tag's body
     centre_m: Float[Array, "tag 3"]
     step_m: Float[Array, "tag antenna"]  # change of the body's range since the last frame
-    body_nats: Float[Array, " tag"]  # evidence of the reads that the tag moves with the body, against phases at random
+    body_nats: Float[
+        Array, " tag"
+    ]  # evidence of the reads that the tag moves with the body, against phases at random; 0 without
     stationary_nats: Float[Array, " tag"]  # ... that it is stationary
-    num_reads: Float[Array, " tag"]  # recent ones, as `Detection.received` counts them
+    recent: RecentReads
     confidence: Float[Array, " tag"]
     detected: Bool[Array, " tag"]
     status: Int8[Array, " tag"]  # codes of `Status`
@@ -145,7 +148,7 @@ class TagAttention(AbstractTracer):
             attention=attention,
             body=None if self.body is None else self.body.init(num_tags, num_segments),
             hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
-            num_reads=jnp.zeros(num_tags),
+            recent=RecentReads.nothing(num_tags),
         )
 
     def step(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, Trace]:
@@ -169,7 +172,7 @@ class TagAttention(AbstractTracer):
         segments, found = self.segments.step(
             camera, state.segments, frame.depth_m, frame.backward_px, dt_s, frame.objects
         )
-        tags, out = self.associate(state.tags, found, frame)
+        tags, out = self.associate(camera, state.tags, found, frame)
         labels = filled_labels(found.labels, frame.depth_m)
         if frame.objects is not None:
             labels = without_joined(labels, frame.objects, found.area.shape[0])
@@ -184,34 +187,18 @@ class TagAttention(AbstractTracer):
             tags=out,
         )
 
-    def associate(self, state: TagState, found: SegmentFrame, frame: Frame) -> tuple[TagState, Association]:
+    def associate(
+        self, camera: Camera, state: TagState, found: SegmentFrame, frame: Frame
+    ) -> tuple[TagState, Association]:
         """The next state of the tags and their bodies, from a frame's segments and reads."""
-        assert frame.arrivals is not None
         assert frame.present is not None
         now_s, since_s = frame.time_s, _last_s(state, frame)
         dt_s = now_s - since_s
         travel, pooling = state.travel, None
         if self.travel is not None and travel is not None:
             travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
-        dwell, log_likelihood = state.dwell, jnp.zeros((frame.present.shape[0], found.area.shape[0]))
-        if self.dwell is not None and dwell is not None:
-            dwell, log_likelihood = self.dwell.step(
-                self.reader, dwell, frame.arrivals, found.increment_m, found.centre_m[:, 2], found.source,
-                since_s, now_s, found.area > 0,
-            )  # fmt: skip
-            if self.hidden is not None and state.hidden is not None:
-                newborn = found.source > -2
-                log_likelihood = self.hidden.inherited(state.hidden, log_likelihood, found.centre_m, newborn)
-            if self.travel is not None and pooling is not None:
-                log_likelihood = self.travel.heal(pooling, log_likelihood, dt_s)
-            dwell = eqx.tree_at(lambda one: one.log_likelihood, dwell, log_likelihood)
-        attention = state.attention
-        if self.attention is not None and attention is not None:
-            attention, agreed = self.attention.step(
-                attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
-            )
-            log_likelihood = log_likelihood + self.attention.weight.value * agreed
-        body, membership, place = self._bodies(state.body, log_likelihood, found, since_s, now_s)
+        dwell, attention, evidence, added = self._evidence(state, found, pooling, frame)
+        body, membership, place = self._bodies(state.body, evidence, found, since_s, now_s)
         membership = jnp.where(frame.present[:, None], membership, 0.0)
         weight = membership * found.area[None]
         total = jnp.sum(weight, axis=1)
@@ -222,32 +209,64 @@ class TagAttention(AbstractTracer):
         # Parts that move against the tag's place (legs, say) belong to the body, and have less evidence than the place.
         at_place = membership * place
         mass = jnp.sum(at_place, axis=1)
-        body_nats = safe_divide(jnp.sum(at_place * log_likelihood, axis=1), mass)
-        body_nats = jnp.where((total > 0) & (mass > 0), body_nats, -1e4)
-        hidden, hides = state.hidden, jnp.zeros(total.shape, bool)
+        some = (total > 0) & (mass > 0)
+        body_nats = safe_divide(jnp.sum(at_place * evidence, axis=1), mass)
+        added_nats = safe_divide(jnp.sum(at_place * added, axis=1), mass)
+        centre_m, hidden, hides = mean(found.centre_m), state.hidden, jnp.zeros(total.shape, bool)
         if self.hidden is not None and hidden is not None and self.dwell is not None:
-            velocity = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
+            velocity_m_s = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
             kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
-            hidden, hides = self.hidden.step(hidden, body_nats, mean(found.centre_m), velocity, kept, dt_s)
-        num_reads = self.detection.received(state.num_reads, frame.arrivals, since_s, now_s)
-        confidence = self.detection.confidence(body_nats, log_likelihood[:, STATIC], num_reads)
+            unseen = self.hidden.out_of_view(camera, hidden, frame.depth_m, found.labels, membership, dt_s)
+            hidden, remembered = self.hidden.step(hidden, body_nats, some, centre_m, velocity_m_s, kept, dt_s)
+            hides = remembered & unseen
+        recent = self.detection.received(state.recent, frame.arrivals, added_nats, since_s, now_s)
+        confidence = self.detection.confidence(body_nats, evidence[:, STATIC], recent)
         in_view = jnp.any(membership > 0.5, axis=1)
         confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
         detected = self.detection.detected(confidence)
         last_nats = body_nats if hidden is None else jnp.where(hides, hidden.evidence_nats, body_nats)
-        terms = self.detection.probabilities(last_nats, log_likelihood[:, STATIC], num_reads)
+        terms = self.detection.probabilities(last_nats, evidence[:, STATIC], recent)
         status = self.detection.status(terms, detected, in_view, hides)
-        return TagState(now_s, travel, dwell, attention, body, hidden, num_reads), Association(
+        return TagState(now_s, travel, dwell, attention, body, hidden, recent), Association(
             membership=membership,
-            centre_m=mean(found.centre_m),
+            centre_m=centre_m,
             step_m=mean(found.increment_m.T),
             body_nats=body_nats,
-            stationary_nats=log_likelihood[:, STATIC],
-            num_reads=num_reads,
+            stationary_nats=evidence[:, STATIC],
+            recent=recent,
             confidence=confidence,
             detected=detected,
             status=jnp.where(frame.present, status, jnp.int8(Status.UNKNOWN)),
         )
+
+    def _evidence(
+        self, state: TagState, found: SegmentFrame, pooling: Pooling | None, frame: Frame
+    ) -> tuple[DwellState | None, AttentionState | None, Float[Array, "tag segment"], Float[Array, "tag segment"]]:
+        """The states of the stages that use reads, their evidence, and what this frame's reads have added to that of dwells."""
+        assert frame.arrivals is not None
+        assert frame.present is not None
+        now_s, since_s, source = frame.time_s, _last_s(state, frame), row_sources(found.source)
+        dt_s = now_s - since_s
+        dwell, attention = state.dwell, state.attention
+        evidence = added = jnp.zeros((frame.present.shape[0], found.area.shape[0]))
+        if self.dwell is not None and dwell is not None:
+            before = jnp.exp(-dt_s / self.dwell.memory_s.value) * jnp.take(dwell.log_likelihood, source, axis=1)
+            dwell, evidence = self.dwell.step(
+                self.reader, dwell, frame.arrivals, found.increment_m, found.centre_m[:, 2], found.source,
+                since_s, now_s, found.area > 0,
+            )  # fmt: skip
+            added = evidence - before
+            if self.hidden is not None and state.hidden is not None:
+                evidence = self.hidden.inherited(state.hidden, evidence, found.centre_m, found.source > -2)
+            if self.travel is not None and pooling is not None:
+                evidence = self.travel.heal(pooling, evidence, dt_s)
+            dwell = eqx.tree_at(lambda one: one.log_likelihood, dwell, evidence)
+        if self.attention is not None and attention is not None:
+            attention, agreed = self.attention.step(
+                attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
+            )
+            evidence = evidence + self.attention.weight.value * agreed
+        return dwell, attention, evidence, added
 
     def _bodies(
         self,
@@ -313,7 +332,7 @@ def _last_s(state: TagState, frame: Frame) -> Float[Array, ""]:
 
 def _of_tags(state: TagState) -> list[Any]:
     """The arrays with one row a tag."""
-    found = [state.num_reads, *jax.tree.leaves(state.hidden)]
+    found = [*jax.tree.leaves(state.recent), *jax.tree.leaves(state.hidden)]
     if state.dwell is not None:
         dwell = state.dwell
         found += [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
