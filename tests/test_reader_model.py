@@ -23,10 +23,9 @@ def test_thermal_noise_is_that_of_the_measured_fit():
 
 @pytest.mark.parametrize("modulo_pi", [True, False])
 def test_the_concentration_is_the_inverse_of_the_variance(modulo_pi):
-    reader = ReaderModel(spread_rad=0.07, still_spread_rad=0.02, modulo_pi=modulo_pi)
-    still = np.array([True, False])
-    found = reader.concentration(jnp.asarray(-55.0), jnp.asarray(still))
-    variance = thermal_sigma_rad(np.full(2, -55.0)) ** 2 + np.where(still, 0.02, 0.07) ** 2
+    reader = ReaderModel(spread_rad=0.07, still_spread_rad=0.02, moving_m_s=0.1, modulo_pi=modulo_pi)
+    found = reader.concentration(jnp.asarray(-55.0), jnp.array([0.0, -0.1, 0.1, 1e6]))
+    variance = thermal_sigma_rad(np.full(4, -55.0)) ** 2 + np.array([0.02**2, *[(0.02**2 + 0.07**2) / 2] * 2, 0.07**2])
     np.testing.assert_allclose(found, 1 / ((4 if modulo_pi else 1) * variance), rtol=1e-5)
 
 
@@ -77,10 +76,10 @@ def test_a_read_adds_what_scipy_says_also_to_phasors_of_thousands():
 
 def test_gradients_are_finite_without_rssi():
     def score(reader, rssi):
-        return jnp.sum(reader.concentration(rssi, jnp.zeros(5, bool)))
+        return jnp.sum(reader.concentration(rssi, jnp.array([0.0, 0.01, -0.1, 0.5, 0.0])))
 
     gradient = eqx.filter_grad(score)(ReaderModel(), jnp.asarray(RSSI_DBM))
-    assert len(jax.tree.leaves(gradient)) == 7
+    assert len(jax.tree.leaves(gradient)) == 8
     assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(gradient))
 
 

@@ -38,7 +38,16 @@ OBJECTIVE = ObjectiveSettings(
     memory=1.0, span_frames=6, skip_frames=6, max_reads=128, num_channels=4, future_stride=1, calibration=0.0
 )
 LEARNED = {
-    "reader": {"slope_per_dbm", "intercept", "floor_rad", "spread_rad", "still_spread_rad", "drift_m", "outlier"},
+    "reader": {
+        "slope_per_dbm",
+        "intercept",
+        "floor_rad",
+        "spread_rad",
+        "still_spread_rad",
+        "moving_m_s",
+        "drift_m",
+        "outlier",
+    },
     "travel": {"reach_m", "noise_m", "noise_fraction", "travel_per_m", "heal_s"},
     "dwell": {"memory_s"},
     "whole": {"travel_m_s", "share"},

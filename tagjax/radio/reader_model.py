@@ -14,7 +14,12 @@ probability q that is log((1 - q) exp(g) + q):
     P = P' + w exp(j m phi) ,    g = log I0(|P|) - log I0(|P'|) - log I0(w) .
 
 The error of a motion since the last read counts, not that since the dwell began: reads that follow each other agree in phase
-even where reflections have changed it along the way.
+even where reflections have changed it along the way. Reflections change with motion: what moves at a speed u has, beside
+thermal noise, the variance
+
+    s_0^2 + (s^2 - s_0^2) u^2 / (u^2 + v0^2) ,
+
+from s_0 at rest to s. So what rests, before it is moved, is as probable for a tag that does not move as the background is.
 """
 
 from __future__ import annotations
@@ -22,7 +27,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 from jax.scipy.special import i0e
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..core.constrained import Fraction, Negative, Positive
 from ..core.numerics import cos_sin, safe_sqrt
@@ -40,8 +45,9 @@ class ReaderModel(eqx.Module):
     slope_per_dbm: Negative  # d log10(thermal noise / rad) / d RSSI
     intercept: Float[Array, "*shape"]  # log10(thermal noise / rad) at 0 dBm
     floor_rad: Positive  # thermal noise at a high RSSI
-    spread_rad: Positive  # standard deviation beside thermal noise: reflections, errors of the motion
-    still_spread_rad: Positive  # the same of a tag that stays in place
+    spread_rad: Positive  # s: standard deviation beside thermal noise: reflections, errors of the motion
+    still_spread_rad: Positive  # s_0: the same of a tag that stays in place
+    moving_m_s: Positive  # v0: change of the range a second, above which a tag moves rather than stays
     drift_m: Positive  # variance of a motion's error, m^2, for each metre of the way, 1 m from the camera
     outlier: Fraction  # probability of a read with any phase
     modulo_pi: bool = eqx.field(static=True)  # phases count modulo pi, so that pi flips do not matter
@@ -54,17 +60,19 @@ class ReaderModel(eqx.Module):
         floor_rad: float = FLOOR_RAD,
         spread_rad: float = 0.064,
         still_spread_rad: float = 0.03,
+        moving_m_s: float = 0.06,
         drift_m: float = 0.00014,
         outlier: float = 0.04,
         modulo_pi: bool = True,
     ) -> None:
-        """Raises `ValueError` for a spread, floor or drift that is not positive, a slope that is not negative, or an outlier
+        """Raises `ValueError` for a spread, floor, speed or drift that is not positive, a slope that is not negative, or an outlier
         probability of 0 or 1."""
         self.slope_per_dbm = Negative(slope_per_dbm)
         self.intercept = jnp.asarray(intercept, jnp.float32)
         self.floor_rad = Positive(floor_rad)
         self.spread_rad = Positive(spread_rad)
         self.still_spread_rad = Positive(still_spread_rad)
+        self.moving_m_s = Positive(moving_m_s)
         self.drift_m = Positive(drift_m)
         self.outlier = Fraction(outlier)
         self.modulo_pi = modulo_pi
@@ -80,10 +88,15 @@ class ReaderModel(eqx.Module):
         by_rssi = jnp.exp(jnp.log(10.0) * (self.slope_per_dbm.value * rssi + self.intercept))
         return jnp.sqrt(jnp.square(self.floor_rad.value) + jnp.square(by_rssi))
 
-    def concentration(self, rssi_dbm: Float[Array, "*#batch"], still: Bool[Array, "*#batch"]) -> Float[Array, "*batch"]:
-        """w = 1 / (m^2 variance) of reads; where `still`, `still_spread_rad` is the spread beside thermal noise."""
-        spread = jnp.where(still, self.still_spread_rad.value, self.spread_rad.value)
-        return 1.0 / (self.multiple**2 * (jnp.square(self.thermal_rad(rssi_dbm)) + jnp.square(spread)))
+    def concentration(
+        self, rssi_dbm: Float[Array, "*#batch"], speed_m_s: Float[Array, "*#batch"]
+    ) -> Float[Array, "*batch"]:
+        """w = 1 / (m^2 variance) of reads of a tag whose range changes at `speed_m_s` (of either sign)."""
+        square = jnp.square(speed_m_s)
+        moving = square / (square + jnp.square(self.moving_m_s.value))
+        still = jnp.square(self.still_spread_rad.value)
+        spread = still + (jnp.square(self.spread_rad.value) - still) * moving
+        return 1.0 / (self.multiple**2 * (jnp.square(self.thermal_rad(rssi_dbm)) + spread))
 
     def moved(
         self,

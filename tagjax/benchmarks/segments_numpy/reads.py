@@ -24,16 +24,21 @@ class Reader:
 
     def __init__(self, model: ReaderModel) -> None:
         self.slope, self.intercept = np.float32(model.slope_per_dbm.value), np.float32(model.intercept)
-        names = "floor_rad", "spread_rad", "still_spread_rad", "drift_m", "outlier"
+        names = "floor_rad", "spread_rad", "still_spread_rad", "moving_m_s", "drift_m", "outlier"
         self.value = {name: np.float32(getattr(model, name).value) for name in names}
         self.multiple = np.float32(model.multiple)
 
-    def concentration(self, rssi_dbm: Float[np.ndarray, " read"], spread_rad: np.float32) -> np.ndarray:
-        """Of reads, with a spread beside thermal noise."""
+    def concentration(self, rssi_dbm: Float[np.ndarray, " read"], speed_m_s: np.ndarray) -> np.ndarray:
+        """Of reads (read, segment), by the speeds (read, segment)."""
         rssi = np.where(np.isfinite(rssi_dbm), rssi_dbm, np.float32(UNKNOWN_RSSI_DBM))
         by_rssi = np.exp(np.log(np.float32(10)) * (self.slope * rssi + self.intercept))
         thermal = np.square(self.value["floor_rad"]) + np.square(by_rssi)
-        return 1 / (np.square(self.multiple) * (thermal + np.square(spread_rad)))
+        square, (still, spread) = (
+            np.square(speed_m_s),
+            np.square([self.value["still_spread_rad"], self.value["spread_rad"]]),
+        )
+        beside = still + (spread - still) * square / (square + np.square(self.value["moving_m_s"]))
+        return 1 / (np.square(self.multiple) * (thermal[:, None] + beside))
 
     def moved(self, phasor: np.ndarray, moved_m: np.ndarray, depth_m: np.ndarray, carrier_hz: np.ndarray) -> np.ndarray:
         """Complex phasors (read, segment) after motions of what is `depth_m` (segment) away."""
@@ -118,10 +123,7 @@ class Dwells:
         goes_on = (arrivals["channel"][at] == self.channel[tag, antenna])[:, None]
         phasor = np.where(goes_on, self.phasor[rows], np.complex64(0))
         moved_m = np.where(goes_on, distance_m - self.read_m[rows], np.float32(0))
-        value = self.reader.value
-        concentration = np.empty(distance_m.shape, np.float32)
-        concentration[:] = self.reader.concentration(rssi_dbm, value["spread_rad"])[:, None]
-        concentration[:, 0] = self.reader.concentration(rssi_dbm, value["still_spread_rad"])
+        concentration = self.reader.concentration(rssi_dbm, increment_m[:, slots][antenna] / span_s)
         phasor = self.reader.moved(phasor, moved_m, depth_m[slots], carrier_hz)
         evidence, phasor = self.reader.add(phasor, concentration, arrivals["phase_rad"][at])
         self.phasor[rows], self.read_m[rows] = phasor, distance_m

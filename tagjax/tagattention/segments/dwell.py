@@ -21,6 +21,7 @@ from ...core.constrained import Positive
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
 from .cells import row_sources
+from .labels import STATIC
 
 _SHORTEST_FRAME_S = 1e-6
 _CHUNK = 8  # reads: valid ones come first in a frame's buffer, which is mostly empty
@@ -89,8 +90,7 @@ class DwellEvidence(eqx.Module):
         all take part.
         """
         source = row_sources(newborn_source)
-        moving = jnp.arange(increment_m.shape[1]) > 0
-        increment_m = jnp.where(moving, increment_m, 0.0)
+        increment_m = increment_m.at[:, STATIC].set(0.0)
         last_m = _taken(state.distance_m, source)
         memory_s = self.memory_s.value
         decay = jnp.exp(-(now_s - since_s) / memory_s)
@@ -103,10 +103,11 @@ class DwellEvidence(eqx.Module):
         of_tags = tables, decay * state.log_likelihood
 
         def scanned(
-            of_tags: tuple[_Rows, Array], last_m: Array, increment_m: Array, depth_m: Array, moving: Array
+            of_tags: tuple[_Rows, Array], last_m: Array, increment_m: Array, depth_m: Array
         ) -> tuple[_Rows, Array, Array]:
             """The tables and the evidence (some or all columns) after the reads, and the channels of the dwells."""
             tables, log_likelihood = of_tags
+            speed_m_s = increment_m / jnp.maximum(now_s - since_s, _SHORTEST_FRAME_S)
 
             def updated(rows: _Rows, read: Arrivals, part: Array, goes_on: Array) -> tuple[Array, _Rows]:
                 """The evidence of a read for every segment, and the rows of its tag and antenna after it."""
@@ -114,7 +115,7 @@ class DwellEvidence(eqx.Module):
                 real, imaginary = (jnp.where(goes_on, row, 0.0) for row in rows[:2])
                 moved_m = jnp.where(goes_on, distance_m - rows[2], 0.0)
                 real, imaginary = reader.moved(real, imaginary, moved_m, depth_m, read.carrier_hz)
-                concentration = reader.concentration(read.rssi_dbm, ~moving)
+                concentration = reader.concentration(read.rssi_dbm, speed_m_s[read.antenna])
                 evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
                 return evidence, (real, imaginary, distance_m)
 
@@ -150,12 +151,12 @@ class DwellEvidence(eqx.Module):
 
         def of_all() -> tuple[_Rows, Array, Array]:
             inherited = jax.tree.map(lambda rows: _taken(rows, source), of_tags)
-            return scanned(inherited, last_m, increment_m, depth_m, moving)
+            return scanned(inherited, last_m, increment_m, depth_m)
 
         def of_those(exists: Bool[Array, " segment"]) -> tuple[_Rows, Array, Array]:
             (slots,) = jnp.nonzero(exists, size=_FEW, fill_value=shape[-1])
             inherited = jax.tree.map(lambda rows: _taken(rows, _taken(source, slots)), of_tags)
-            columns = (_taken(rows, slots) for rows in (last_m, increment_m, depth_m, moving))
+            columns = (_taken(rows, slots) for rows in (last_m, increment_m, depth_m))
             *changed, channel = scanned(inherited, *columns)
             put = lambda rows, own: rows.at[:, slots].set(own, mode="drop", indices_are_sorted=True)  # noqa: E731
             return (*jax.tree.map(put, of_tags, tuple(changed)), channel)
@@ -163,7 +164,7 @@ class DwellEvidence(eqx.Module):
         if exists is None or shape[-1] <= _FEW:
             tables, log_likelihood, channel = of_all()
         else:
-            some, exists = jnp.any(exists), exists | ~moving
+            some, exists = jnp.any(exists), exists.at[STATIC].set(True)
             few = some & (jnp.sum(exists, dtype=jnp.int32) <= _FEW)
             tables, log_likelihood, channel = jax.lax.cond(few, lambda: of_those(exists), of_all)
         real, imaginary, read_m = (table.reshape(shape) for table in tables)
