@@ -134,9 +134,13 @@ class ReaderModel(eqx.Module):
         own_real, own_imaginary = concentration * cos, concentration * sin
         before = safe_sqrt(jnp.square(real) + jnp.square(imaginary))
         after = safe_sqrt(jnp.square(real + own_real) + jnp.square(imaginary + own_imaginary))
-        # |S'| + w - |S| as a quotient: phasors reach thousands, and their difference in float32 would err by 1e-3 nats.
+        # |S'| + w - |S| as a quotient: phasors reach thousands, and their difference in float32 would err by 1e-3 nats. For
+        # the same reason |S'| w - S' . w, where they agree, is (S' x w)^2 / (|S'| w + S' . w).
         along = real * own_real + imaginary * own_imaginary
-        lost = 2.0 * (before * concentration - along) / (after + before + concentration)
+        across, both = real * own_imaginary - imaginary * own_real, before * concentration
+        agree = along > 0
+        apart = jnp.where(agree, jnp.square(across) / jnp.where(agree, both + along, 1.0), both - along)
+        lost = 2.0 * apart / (after + before + concentration)
         ratio = jnp.exp(-lost) * i0e(after) / (i0e(before) * i0e(concentration))
         outlier = self.outlier.value
         inlier = (1.0 - outlier) * ratio

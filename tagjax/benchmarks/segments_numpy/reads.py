@@ -55,8 +55,10 @@ class Reader:
         angle = (self.multiple * phase_rad)[:, None]
         own = concentration * (np.cos(angle) + 1j * np.sin(angle))
         before, after = np.abs(phasor), np.abs(phasor + own)
-        along = np.real(phasor * np.conj(own))
-        lost = 2 * (before * concentration - along) / (after + before + concentration)
+        product, both = phasor * np.conj(own), before * concentration
+        agree = product.real > 0
+        apart = np.where(agree, np.square(product.imag) / np.where(agree, both + product.real, 1), both - product.real)
+        lost = 2 * apart / (after + before + concentration)
         ratio = np.exp(-lost) * i0e(after) / (i0e(before) * i0e(concentration))
         outlier = self.value["outlier"]
         inlier = (1 - outlier) * ratio
