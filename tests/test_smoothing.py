@@ -20,10 +20,11 @@ from tagjax.recording import Recording, RecordingError
 from tagjax.recording.store import open_recording
 from tagjax.recording.time_reversal import time_reversed
 from tagjax.tagattention import TagAttention
+from tagjax.tagattention.backward_message import BackwardMessage
 from tagjax.tagattention.literal import TagAttentionLiteral
 from tagjax.tracing.clips import Clip, ClipSettings, load_clip
 from tagjax.tracing.recordings import trace_recording
-from tagjax.tracing.tracer import BackwardMessage, Camera, Frame, Trace, trace
+from tagjax.tracing.tracer import Camera, Frame, Trace, trace
 from tagjax.training.evaluate import evaluate_tracers
 
 EPCS = list(synthetic.EPCS)

@@ -15,11 +15,12 @@ from tagjax.core.geometry import pixel_rays
 from tagjax.radio.reads import RadioWindow
 from tagjax.recording import Intrinsics
 from tagjax.tagattention import TagAttention, paper_limit
+from tagjax.tagattention.backward_message import BackwardMessage
 from tagjax.tagattention.frame_trace import describe
 from tagjax.tagattention.literal import FLOOR, TagAttentionLiteral
 from tagjax.tagattention.motion import empty_motion, push_gather, push_splat
 from tagjax.tracing.clips import load_clip
-from tagjax.tracing.tracer import BackwardMessage, Camera, Frame, trace
+from tagjax.tracing.tracer import Camera, Frame, trace
 
 
 def _learnable(**changed):

@@ -11,10 +11,11 @@ from jaxtyping import Array, Bool, Float
 
 from ..core.numerics import safe_sqrt
 from ..radio.reads import PhaseReads, RadioWindow
-from ..tracing.tracer import MAX_OBJECTS, BackwardMessage, Camera, Frame, Trace
+from ..tracing.tracer import MAX_OBJECTS, Camera, Frame, Trace
 from ._evidence import AbstractEvidence
 from .anchor import Anchor, joined, log_density, lost_drift_m, move_anchor, update_belief, votes
 from .background import Background, empty_background, is_background, remember, shows_rest
+from .backward_message import BackwardMessage
 from .common_fate import common_fate
 from .frame_trace import describe
 from .motion import MotionMap, PlaceMap, carry, empty_motion, empty_places, push_gather, push_places
@@ -119,6 +120,9 @@ class AbstractStages(AbstractEvidence):
     ) -> tuple[TagAttentionState, BackwardMessage]:
         state, seen = self._observe(camera, state, frame)
         return state, BackwardMessage(seen.belief.log_odds, state.anchor, state.phases.moved)
+
+    def compact(self, message: BackwardMessage) -> BackwardMessage:
+        return eqx.tree_at(lambda one: one.log_odds, message, message.log_odds.astype(jnp.float16))
 
     def _observe(
         self, camera: Camera, state: TagAttentionState, frame: Frame

@@ -197,9 +197,11 @@ def load_clip(
     def stacked(parts):
         return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *parts)
 
-    since_ns = int(recording.time_ns[start - 1]) if start else None
+    # A read at the very time of a frame is one of that frame's, also where time is reversed: not one after it.
+    until_ns = recording.time_ns - int(recording.reversed_from is not None)
+    since_ns = int(until_ns[start - 1]) if start else None
     arrivals, _ = frame_arrivals(
-        recording.reads, tags, chosen, recording.time_ns[start:stop], origin_ns, MAX_ARRIVALS, since_ns=since_ns
+        recording.reads, tags, chosen, until_ns[start:stop], origin_ns, MAX_ARRIVALS, since_ns=since_ns
     )
     radio, reads = jax.tree.map(jnp.asarray, stacked([stacked([radio_of(e, a) for a in chosen]) for e in tags]))
     return Clip(

@@ -16,7 +16,7 @@ import numpy as np
 from ..radio.reads import RadioWindow
 from ..recording import Recording, RecordingError, RecordingWarning
 from ..recording.time_reversal import time_reversed
-from .tracer import AbstractSmoother, AbstractTracer, BackwardMessage, Camera, Frame, Trace
+from .tracer import AbstractSmoother, AbstractTracer, Camera, Frame, Trace
 
 CAMERA_MOVED = (
     "the camera moved {}: nearly all of the static background shows another depth. Tracing goes on, but what the camera's "
@@ -44,8 +44,9 @@ def _init(tracer: AbstractTracer, camera: Camera, frame: Frame) -> Any:
 
 
 @eqx.filter_jit
-def _step_back(tracer: AbstractSmoother, camera: Camera, state: Any, frame: Frame) -> tuple[Any, BackwardMessage]:
-    return tracer.backward_step(camera, state, frame)
+def _step_back(tracer: AbstractSmoother, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Any]:
+    state, message = tracer.backward_step(camera, state, frame)
+    return state, tracer.compact(message)
 
 
 @eqx.filter_jit
@@ -89,8 +90,8 @@ def trace_recording(
     traced in groups of `tags_at_once`; the last group is padded with tags without reads, so that one compilation serves
     all groups. Tags compete for pixels within their group.
 
-    With `smooth` in the settings a backward pass runs first and the trace of a frame uses later frames too; its log odds
-    are kept in half precision in a temporary file. Raises `RecordingError` for a tracer that is no `AbstractSmoother`.
+    With `smooth` in the settings a backward pass runs first and the trace of a frame uses later frames too; its messages are
+    kept in a temporary file, in the types of `AbstractSmoother.compact`. Raises `RecordingError` for a tracer that is no `AbstractSmoother`.
     """
     settings = settings or TraceSettings()
     first, last = frames or (0, recording.num_frames)
@@ -100,7 +101,7 @@ def trace_recording(
         )
     if not epcs:
         raise RecordingError(f"{recording.name}: no tag to trace: the recording holds no read, or epcs is empty.")
-    messages: Callable[[int], BackwardMessage] | None = None
+    messages: Callable[[int], list[Any]] | None = None
     if settings.smooth:
         if not isinstance(tracer, AbstractSmoother):
             raise RecordingError(
@@ -119,7 +120,7 @@ def _run(
     epcs: Sequence[str],
     settings: TraceSettings,
     frames: tuple[int, int],
-    messages: Callable[[int], BackwardMessage] | None = None,
+    messages: Callable[[int], list[Any]] | None = None,
 ) -> Iterator[tuple[int, list[Any]]]:
     """Every frame's number, and the output of `step` for each group of tags (NumPy leaves)."""
     first, last = frames
@@ -138,8 +139,7 @@ def _run(
             for number, part in enumerate(parts):
                 frame = jax.tree.map(lambda leaf, i=index: jnp.asarray(leaf[i]), part)
                 if known is not None:
-                    chosen = slice(groups[number], groups[number] + size)
-                    message = jax.tree.map(lambda leaf, part=chosen: jnp.asarray(leaf[part], jnp.float32), known)
+                    message = jax.tree.map(_restored, known[number])
                     frame = eqx.tree_at(
                         lambda one: one.backward_message, frame, message, is_leaf=lambda leaf: leaf is None
                     )
@@ -160,6 +160,10 @@ def _warn_of_motion(tracer: AbstractTracer, state: Any, name: str, stop: int) ->
     return True
 
 
+def _restored(leaf: np.ndarray) -> jax.Array:
+    return jnp.asarray(leaf, jnp.float32 if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype)
+
+
 def _backward_pass(
     tracer: AbstractSmoother,
     recording: Recording,
@@ -167,22 +171,24 @@ def _backward_pass(
     epcs: Sequence[str],
     settings: TraceSettings,
     frames: tuple[int, int],
-) -> Callable[[int], BackwardMessage]:
-    """Run the backward pass; the returned function gives the message for a frame by its number.
-
-    The message's tag axis covers all groups, padding included.
-    """
+) -> Callable[[int], list[Any]]:
+    """Run the backward pass; the returned function gives the messages for a frame by its number, one a group of tags."""
     count, (first, last) = recording.num_frames, frames
-    kept: dict[int, BackwardMessage] = {}
-    log_odds: np.ndarray | None = None
+    rows: np.ndarray | None = None
+    tree: Any = None
     for number, outputs in _run(
         _step_back, tracer, time_reversed(recording), load, epcs, settings, (count - last, count - first)
     ):
-        message: BackwardMessage = jax.tree.map(lambda *leaves: np.concatenate(leaves), *outputs)
-        if log_odds is None:
+        leaves, tree = jax.tree.flatten(outputs)
+        if rows is None:
+            row = np.dtype([(f"leaf_{index}", leaf.dtype, leaf.shape) for index, leaf in enumerate(leaves)])
             with tempfile.TemporaryFile() as file:  # unnamed: deleted together with the array
-                log_odds = np.memmap(file, np.float16, "w+", shape=(last - first, *message.log_odds.shape))
-        frame = count - 1 - number
-        log_odds[frame - first] = message.log_odds
-        kept[frame] = eqx.tree_at(lambda one: one.log_odds, message, log_odds[frame - first])
-    return kept.__getitem__
+                rows = np.memmap(file, row, "w+", shape=(last - first,))
+        for name, leaf in zip(rows.dtype.names or (), leaves, strict=True):
+            rows[name][count - 1 - number - first] = leaf
+
+    def messages(frame: int) -> list[Any]:
+        assert rows is not None
+        return jax.tree.unflatten(tree, [rows[name][frame - first] for name in rows.dtype.names or ()])
+
+    return messages

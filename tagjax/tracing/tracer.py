@@ -55,14 +55,6 @@ class Camera(eqx.Module):
         return along(0, width), along(1, height)
 
 
-class BackwardMessage(eqx.Module):
-    """Evidence from all frames after one, for every tag: the backward pass of offline (two-pass) smoothing computes it."""
-
-    log_odds: Float[Array, "*time tag height width"]  # of object against background
-    anchor: eqx.Module  # (*time, tag, antenna, ...): range posterior of the tag at this frame
-    moved: Float[Array, "*time tag antenna"]  # evidence of later reads that the tag moves, nats
-
-
 class Frame(eqx.Module):
     """The input of a tracer at one frame; in a clip every leaf has a leading time axis.
 
@@ -80,7 +72,7 @@ class Frame(eqx.Module):
     colour: UInt8[Array, "*time rows columns 3"] | None = None  # full-size picture, for tracers that compute the flow
     arrivals: Arrivals | None = None  # (*time, reads): of all tags and antennas, later than the last frame
     present: Bool[Array, "*time tag"] | None = None  # false for places that hold no tag
-    backward_message: BackwardMessage | None = None  # offline smoothing only
+    backward_message: Any | None = None  # offline smoothing only: of `AbstractSmoother.backward_step`
     objects: Int[Array, "*time height width"] | None = None  # error budgets only: given objects, 0 = none
 
 
@@ -121,11 +113,19 @@ class AbstractTracer(eqx.Module):
 
 
 class AbstractSmoother(AbstractTracer):
-    """A tracer with a backward pass, whose messages the forward pass of offline smoothing uses."""
+    """A tracer with a backward pass, whose messages the forward pass of offline smoothing uses.
+
+    A message is of the tracer's own type: a Module of arrays, the evidence of all later frames and reads. `step` finds it in
+    `frame.backward_message`, None online. A read at the very time of a frame belongs to the forward pass.
+    """
 
     @abc.abstractmethod
-    def backward_step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, BackwardMessage]:
-        """`step` on the time-reversed recording: the next state, and the evidence from all frames after this one."""
+    def backward_step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Any]:
+        """`step` on the time-reversed recording: the next state, and the message for the forward pass at this frame."""
+
+    def compact(self, message: Any) -> Any:
+        """The message in the types in which it is stored from one pass to the next; `step` gets its floats as float32."""
+        return message
 
 
 def trace(tracer: AbstractTracer, camera: Camera, clip: Frame) -> Trace:

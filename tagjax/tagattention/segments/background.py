@@ -47,6 +47,12 @@ class BackgroundView(eqx.Module):
         no, zero = jnp.zeros((height, width), bool), jnp.zeros((height, width))
         return BackgroundView(no, no, zero, no, no, no, jnp.zeros(()))
 
+    def without(self, pixels: Bool[Array, "height width"]) -> BackgroundView:
+        """The same, but these pixels are known not to be background."""
+        return eqx.tree_at(
+            lambda one: (one.confirmed, one.matched), self, (self.confirmed & ~pixels, self.matched & ~pixels)
+        )
+
 
 class Background(eqx.Module):
     """Settings of the background model. They are static: only comparisons use them, and no gradient reaches them.

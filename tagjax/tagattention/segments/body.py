@@ -29,6 +29,13 @@ class BodyState(eqx.Module):
     fastest_m_s: Float[Array, " segment"]  # highest speed of late, remembered
 
 
+class LaterBody(eqx.Module):
+    """Offline smoothing: what the backward pass remembers of later frames, as in `BodyState`."""
+
+    membership: Float[Array, "tag segment"]
+    fastest_m_s: Float[Array, " segment"]
+
+
 class Bodies(eqx.Module):
     """Each tag's body at one frame."""
 
@@ -109,13 +116,15 @@ class CarryingBody(eqx.Module):
         newborn_source: Int[Array, " segment"],
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
+        later: LaterBody | None = None,
     ) -> tuple[BodyState, Bodies]:
         """The state after the frame at `now_s`, and each tag's body.
 
         `evidence` is that of the reads for a tag at a segment against one at rest, nats; `area` in pixels, 0 for a slot
         without segment; slot 0 is the static background. `newborn_source` is -2 for a segment that is not newborn, else
         the slot it comes from, or -1. Displacement and life of a newborn segment go on from those of the slot it comes from,
-        as those of `Travel` do.
+        as those of `Travel` do. What is remembered of `later` frames counts as what is remembered of earlier ones does, and is
+        not carried on.
         """
         num_segments = area.shape[0]
         newborn = newborn_source > -2
@@ -129,9 +138,13 @@ class CarryingBody(eqx.Module):
         keep = jnp.exp(-(now_s - since_s) / self.memory_s.value)
         source = jnp.where(newborn, newborn_source, jnp.arange(num_segments, dtype=newborn_source.dtype))
         before_m_s = jnp.where(source > 0, state.fastest_m_s[jnp.maximum(source, 0)], 0.0)
-        fastest_m_s = jnp.maximum(speed_m_s, keep * before_m_s)
+        own_m_s = fastest_m_s = jnp.maximum(speed_m_s, keep * before_m_s)
+        memories = [membership]
+        if later is not None:
+            fastest_m_s = jnp.maximum(own_m_s, later.fastest_m_s)
+            memories.append(later.membership)
         exists = (area > 0) & (jnp.arange(num_segments) > 0)
-        rank = jnp.where(exists, fastest_m_s + 0.1 * jnp.max(membership, axis=0, initial=0.0), -jnp.inf)
+        rank = jnp.where(exists, fastest_m_s + 0.1 * jnp.max(sum(memories), axis=0, initial=0.0), -jnp.inf)
         _, active = jax.lax.top_k(jax.lax.stop_gradient(rank), min(self.num_active, num_segments))
         there = exists[active]
         centre, size = centre_m[active], jnp.where(there, area[active], 0.0)
@@ -146,7 +159,7 @@ class CarryingBody(eqx.Module):
         width = 0.3 * self.moving_m_s.value
         moving = jax.nn.log_sigmoid((fastest_m_s[active] - self.moving_m_s.value) / width)
 
-        def of_tag(own: Float[Array, " active"], memory: Float[Array, " active"]) -> tuple[Array, Array, Array]:
+        def of_tag(own: Float[Array, " active"], *memories: Float[Array, " active"]) -> tuple[Array, Array, Array]:
             smooth = near @ own
             level = jnp.where(there, smooth / self.temperature_nats.value + 4.0 * moving, -jnp.inf)
             top = jnp.max(level, initial=-1e30)
@@ -160,8 +173,8 @@ class CarryingBody(eqx.Module):
             against = jnp.clip(below / self.evidence_nats.value, -self.most_against.value, 0.0)
             trusted = jnp.exp(jnp.clip(below / self.fit_nats.value, -20.0, 0.0))
             # A memory that the place of the tag disagrees with is of another body.
-            valid = jnp.sum(start * memory) > 0
-            memory = jnp.where(valid, memory, 0.0)
+            memory, *later = (jnp.where(jnp.sum(start * one) > 0, one, 0.0) for one in memories)
+            remembered = sum(later, memory)
             weight = start
             log_odds = ratio = jnp.zeros_like(own)
             for _ in range(self.num_rounds):
@@ -170,18 +183,18 @@ class CarryingBody(eqx.Module):
                 apart = _distance_log(
                     centre, middle, self.extent.value**2 * spread_m2 + jnp.square(self.neighbour_m.value)
                 )
-                alone = ratio + self.prior + against + memory + apart
+                alone = ratio + self.prior + against + remembered + apart
                 log_odds = alone + self.neighbours.value * (2.0 * (near @ jax.nn.sigmoid(alone)) - 1.0)
                 weight = size * jax.nn.sigmoid(log_odds)
                 weight = weight + 0.2 * jnp.sum(weight) * start  # the place itself always counts
             after = keep * memory + (1.0 - keep) * jnp.clip(ratio + against, -4.0, 4.0)
             return log_odds, place, jnp.clip(after, -4.0, 4.0)
 
-        log_odds, place, remembered = jax.vmap(of_tag)(evidence[:, active], membership[:, active])
+        log_odds, place, remembered = jax.vmap(of_tag)(*(rows[:, active] for rows in (evidence, *memories)))
         shape = membership.shape
         # Segments that are not looked at forget as well.
         membership = (keep * membership).at[:, active].set(jnp.where(there[None], remembered, 0.0))
-        return BodyState(past, membership, fastest_m_s), Bodies(
+        return BodyState(past, membership, own_m_s), Bodies(
             log_odds=jnp.full(shape, -30.0).at[:, active].set(jnp.where(there[None], log_odds, -30.0)),
             place=jnp.zeros(shape).at[:, active].set(jnp.where(there[None], place, 0.0)),
             speed_m_s=speed_m_s,

@@ -65,18 +65,22 @@ class SegmentTracker(eqx.Module):
         backward_px: Float[Array, "height width 2"],
         dt_s: Float[Array, ""],
         objects: Int[Array, "height width"] | None = None,
+        moves_later: Bool[Array, "height width"] | None = None,
     ) -> tuple[SegmentTrackerState, SegmentFrame]:
         """The next frame, `dt_s` after the last; `depth_m` is z, 0 = missing.
 
         `backward_px` lies on the pixels of this frame and points to the last one; where it is not finite it counts as 0. A
         frame without depth has no labels, and leaves the segments as they are. Only `increment_m` and `motion_m` have
         gradients, in depth and flow. Given `objects` are segments in place of its own (`Frame.objects`).
+        Pixels of `moves_later`, which offline smoothing knows to move, are not static.
         """
         backward_px = jnp.where(jnp.isfinite(backward_px), backward_px, 0.0)
         valid, focal = on_surface(depth_m), focal_px(camera)
         background, view = None, BackgroundView.nothing(*depth_m.shape)
         if self.background is not None and state.background is not None:
             background, view = self.background.step(state.background, depth_m, valid, backward_px, dt_s, focal)
+        if moves_later is not None:
+            view = view.without(moves_later)
         segments, found = self.segmenter.step(
             state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal, objects
         )

@@ -25,15 +25,16 @@ from ...core.constrained import named_values, with_named_values
 from ...core.numerics import safe_divide
 from ...radio.reader_model import ReaderModel
 from ...tracing.status import Status
-from ...tracing.tracer import AbstractTracer, Camera, Frame, Trace
+from ...tracing.tracer import AbstractSmoother, Camera, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
-from .body import BodyState, CarryingBody
+from .body import BodyState, CarryingBody, LaterBody
 from .cells import row_sources
 from .cut import cut_segments
 from .detection import Detection, RecentReads
 from .dwell import DwellEvidence, DwellState
 from .given import without_joined
 from .hidden import HiddenBody, HiddenState
+from .hindsight import Hindsight
 from .labels import STATIC
 from .outline import (
     dense_masks,
@@ -43,33 +44,13 @@ from .outline import (
     segment_boxes,
     segment_centroids,
 )
-from .step import SegmentFrame, SegmentTracker, SegmentTrackerState
-from .travel import Pooling, TravellingTogether, TravelState
+from .state import TagAttentionState, TagState, last_s, of_tags, times
+from .step import SegmentFrame, SegmentTracker
+from .travel import Pooling, TravellingTogether
 from .whole import WholeBody
 
 CAMERA_MOVED_FRACTION = 0.8
 """Of the static background that shows another depth, in two frames: the camera moved. People in front of it cover less."""
-
-
-class TagState(eqx.Module):
-    """What is carried from frame to frame of the tags, and of the motion that all of them share."""
-
-    time_s: Float[Array, ""]  # of the last frame; NaN before the first
-    travel: TravelState | None
-    dwell: DwellState | None
-    attention: AttentionState | None
-    body: BodyState | None
-    hidden: HiddenState | None
-    recent: RecentReads
-
-
-class TagAttentionState(eqx.Module):
-    """What is carried from frame to frame."""
-
-    segments: SegmentTrackerState
-    tags: TagState
-    background_lost: Float[Array, ""]  # of the last frame, as in `SegmentFrame`
-    camera_moved: Bool[Array, ""]  # so far
 
 
 class Association(eqx.Module):
@@ -97,7 +78,7 @@ class SegmentTrace(eqx.Module):
     tags: Association
 
 
-class TagAttention(AbstractTracer):
+class TagAttention(AbstractSmoother):
     """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values.
 
     None is a stage that is off. Without `body` the segments that explain the reads best are the object (`cut_segments`).
@@ -168,9 +149,10 @@ class TagAttention(AbstractTracer):
 
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
         """The next state and the output on segments, without dense masks."""
-        dt_s = frame.time_s - _last_s(state.tags, frame)
+        dt_s, later = frame.time_s - last_s(state.tags, frame), frame.backward_message
+        moves_later = None if later is None else later.moves()
         segments, found = self.segments.step(
-            camera, state.segments, frame.depth_m, frame.backward_px, dt_s, frame.objects
+            camera, state.segments, frame.depth_m, frame.backward_px, dt_s, frame.objects, moves_later
         )
         tags, out = self.associate(camera, state.tags, found, frame)
         labels = filled_labels(found.labels, frame.depth_m)
@@ -187,18 +169,59 @@ class TagAttention(AbstractTracer):
             tags=out,
         )
 
+    def backward_step(
+        self, camera: Camera, state: TagAttentionState, frame: Frame
+    ) -> tuple[TagAttentionState, Hindsight]:
+        """The next state on the time-reversed recording, and what it knows for the forward pass."""
+        dt_s = frame.time_s - last_s(state.tags, frame)
+        segments, found = self.segments.step(
+            camera, state.segments, frame.depth_m, frame.backward_px, dt_s, frame.objects
+        )
+        tags, out = self.associate(camera, state.tags, found, frame)
+        after = TagAttentionState(segments, tags, found.background_lost, state.camera_moved)
+        return after, self.hindsight(found, tags, out)
+
+    def hindsight(self, found: SegmentFrame, tags: TagState, out: Association) -> Hindsight:
+        """What the backward pass hands over at a frame, from its segments, and its state and bodies after this frame."""
+        evidence = jnp.zeros_like(out.membership)
+        if tags.dwell is not None:
+            evidence = evidence + tags.dwell.log_likelihood
+        if self.attention is not None and tags.attention is not None:
+            evidence = evidence + self.attention.weight.value * tags.attention.log_likelihood
+        return Hindsight(
+            labels=found.labels,
+            evidence=evidence,
+            recent=tags.recent,
+            body=None if tags.body is None else LaterBody(tags.body.membership, tags.body.fastest_m_s),
+            member=jnp.any(out.membership > 0.5, axis=0),
+        )
+
+    def compact(self, message: Hindsight) -> Hindsight:
+        """The message in half as many bytes."""
+        return message.compact()
+
     def associate(
         self, camera: Camera, state: TagState, found: SegmentFrame, frame: Frame
     ) -> tuple[TagState, Association]:
-        """The next state of the tags and their bodies, from a frame's segments and reads."""
+        """The next state of the tags and their bodies, from a frame's segments and reads.
+
+        With a `backward_message` the bodies are found by the later reads as well; what is carried on to the next frame rests
+        on the reads up to this one.
+        """
+        assert frame.arrivals is not None
         assert frame.present is not None
-        now_s, since_s = frame.time_s, _last_s(state, frame)
+        now_s, since_s = frame.time_s, last_s(state, frame)
         dt_s = now_s - since_s
         travel, pooling = state.travel, None
         if self.travel is not None and travel is not None:
             travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
-        dwell, attention, evidence, added = self._evidence(state, found, pooling, frame)
-        body, membership, place = self._bodies(state.body, evidence, found, since_s, now_s)
+        dwell, attention, own, added = self._evidence(state, found, pooling, frame)
+        later: Hindsight | None = frame.backward_message
+        evidence, later_body = own, None
+        if later is not None:
+            later_evidence, later_body = later.on(found.labels)
+            evidence = own + later_evidence
+        body, membership, place = self._bodies(state.body, evidence, found, since_s, now_s, later_body)
         membership = jnp.where(frame.present[:, None], membership, 0.0)
         weight = membership * found.area[None]
         total = jnp.sum(weight, axis=1)
@@ -210,22 +233,27 @@ class TagAttention(AbstractTracer):
         at_place = membership * place
         mass = jnp.sum(at_place, axis=1)
         some = (total > 0) & (mass > 0)
-        body_nats = safe_divide(jnp.sum(at_place * evidence, axis=1), mass)
-        added_nats = safe_divide(jnp.sum(at_place * added, axis=1), mass)
+        body_nats, own_nats, added_nats = (
+            safe_divide(jnp.sum(at_place * nats, axis=1), mass) for nats in (evidence, own, added)
+        )
         centre_m, hidden, hides = mean(found.centre_m), state.hidden, jnp.zeros(total.shape, bool)
         if self.hidden is not None and hidden is not None and self.dwell is not None:
             velocity_m_s = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
             kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
             unseen = self.hidden.out_of_view(camera, hidden, frame.depth_m, found.labels, membership, dt_s)
-            hidden, remembered = self.hidden.step(hidden, body_nats, some, centre_m, velocity_m_s, kept, dt_s)
+            hidden, remembered = self.hidden.step(hidden, own_nats, some, centre_m, velocity_m_s, kept, dt_s)
             hides = remembered & unseen
         recent = self.detection.received(state.recent, frame.arrivals, added_nats, since_s, now_s)
-        confidence = self.detection.confidence(body_nats, evidence[:, STATIC], recent)
+        around = recent if later is None else jax.tree.map(jnp.add, recent, later.recent)
+        confidence = self.detection.confidence(body_nats, evidence[:, STATIC], around)
         in_view = jnp.any(membership > 0.5, axis=1)
         confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
         detected = self.detection.detected(confidence)
-        last_nats = body_nats if hidden is None else jnp.where(hides, hidden.evidence_nats, body_nats)
-        terms = self.detection.probabilities(last_nats, evidence[:, STATIC], recent)
+        last_nats, stationary_nats = body_nats, evidence[:, STATIC]
+        if hidden is not None:  # remembered by the reads up to this frame
+            last_nats = jnp.where(hides, hidden.evidence_nats, body_nats)
+            stationary_nats = jnp.where(hides, own[:, STATIC], stationary_nats)
+        terms = self.detection.probabilities(last_nats, stationary_nats, around)
         status = self.detection.status(terms, detected, in_view, hides)
         return TagState(now_s, travel, dwell, attention, body, hidden, recent), Association(
             membership=membership,
@@ -233,7 +261,7 @@ class TagAttention(AbstractTracer):
             step_m=mean(found.increment_m.T),
             body_nats=body_nats,
             stationary_nats=evidence[:, STATIC],
-            recent=recent,
+            recent=around,
             confidence=confidence,
             detected=detected,
             status=jnp.where(frame.present, status, jnp.int8(Status.UNKNOWN)),
@@ -245,7 +273,7 @@ class TagAttention(AbstractTracer):
         """The states of the stages that use reads, their evidence, and what this frame's reads have added to that of dwells."""
         assert frame.arrivals is not None
         assert frame.present is not None
-        now_s, since_s, source = frame.time_s, _last_s(state, frame), row_sources(found.source)
+        now_s, since_s, source = frame.time_s, last_s(state, frame), row_sources(found.source)
         dt_s = now_s - since_s
         dwell, attention = state.dwell, state.attention
         evidence = added = jnp.zeros((frame.present.shape[0], found.area.shape[0]))
@@ -275,6 +303,7 @@ class TagAttention(AbstractTracer):
         found: SegmentFrame,
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
+        later: LaterBody | None = None,
     ) -> tuple[BodyState | None, Float[Array, "tag segment"], Float[Array, "tag segment"]]:
         """The state of the bodies, the probability that each segment belongs to each tag's, and that of the tag's place."""
         if self.body is None or state is None:
@@ -283,7 +312,8 @@ class TagAttention(AbstractTracer):
             return None, membership, membership * found.area[None]
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
         state, bodies = self.body.step(
-            state, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source, since_s, now_s
+            state, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source, since_s, now_s,
+            later,
         )  # fmt: skip
         membership = jax.nn.sigmoid(bodies.log_odds)
         if self.whole is not None:
@@ -308,12 +338,12 @@ class TagAttention(AbstractTracer):
             known = (source >= 0).reshape(-1, *[1] * (new.ndim - 1))
             return jnp.where(known, old[jnp.maximum(source, 0)], new)
 
-        leaves = [moved(new, old) for new, old in zip(_of_tags(fresh), _of_tags(state.tags), strict=True)]
-        return eqx.tree_at(lambda one: one.tags, state, eqx.tree_at(_of_tags, state.tags, leaves))
+        leaves = [moved(new, old) for new, old in zip(of_tags(fresh), of_tags(state.tags), strict=True)]
+        return eqx.tree_at(lambda one: one.tags, state, eqx.tree_at(of_tags, state.tags, leaves))
 
     def shifted(self, state: TagAttentionState, by_s: Float[Array, ""]) -> TagAttentionState:
         """The state with all times later by `by_s`: for another origin of time."""
-        later = eqx.tree_at(_times, state.tags, [one + by_s for one in _times(state.tags)])
+        later = eqx.tree_at(times, state.tags, [one + by_s for one in times(state.tags)])
         return eqx.tree_at(lambda one: one.tags, state, later)
 
     def physical(self) -> dict[str, float]:
@@ -323,29 +353,3 @@ class TagAttention(AbstractTracer):
     def with_physical(self, values: Mapping[str, float]) -> TagAttention:
         """The tracer with these parameters in place of its own. Raises `ValueError` for other names, or impossible values."""
         return with_named_values(self, values)
-
-
-def _last_s(state: TagState, frame: Frame) -> Float[Array, ""]:
-    """The time of the last frame, that of this one before the first. A time that goes back counts as that of the last frame."""
-    return jnp.where(jnp.isfinite(state.time_s), jnp.minimum(state.time_s, frame.time_s), frame.time_s)
-
-
-def _of_tags(state: TagState) -> list[Any]:
-    """The arrays with one row a tag."""
-    found = [*jax.tree.leaves(state.recent), *jax.tree.leaves(state.hidden)]
-    if state.dwell is not None:
-        dwell = state.dwell
-        found += [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
-    if state.attention is not None:
-        found.append(state.attention.log_likelihood)
-    return found if state.body is None else [*found, state.body.membership]
-
-
-def _times(state: TagState) -> list[Any]:
-    """The arrays of times."""
-    found = [state.time_s]
-    if state.travel is not None:
-        found.append(state.travel.past.time_s)
-    if state.attention is not None:
-        found.append(state.attention.time_s)
-    return found if state.body is None else [*found, state.body.past.time_s]
