@@ -51,7 +51,8 @@ def test_labels_memberships_and_boxes_are_those_of_numpy(clip, without):
         frame, own = jax.tree.map(operator.itemgetter(t), (host, expected))
         found = twin.follow(frame)
         np.testing.assert_array_equal(found.labels, own.labels, err_msg=f"frame {t}")
-        np.testing.assert_allclose(found.membership, own.tags.membership, atol=1e-3, err_msg=f"frame {t}")
+        # Two compilations of the tracer itself, with and without XLA's optimisations, differ by 1e-3 here at frame 6.
+        np.testing.assert_allclose(found.membership, own.tags.membership, atol=2e-3, err_msg=f"frame {t}")
         np.testing.assert_array_equal(found.box_px, own.box_px, err_msg=f"frame {t}")
         np.testing.assert_allclose(found.centre_px, own.centre_px, atol=1e-3, err_msg=f"frame {t}")
         np.testing.assert_allclose(found.confidence, own.tags.confidence, atol=1e-3, err_msg=f"frame {t}")
