@@ -24,6 +24,7 @@ def frame_scores(iou: Any, *, rate_hz: float = 10.0, **columns: Any) -> FrameSco
         "confidence": np.ones(num),
         "detected": np.ones(num, bool),
         "status": np.full(num, Status.DETECTED, np.int8),
+        "carrier_iou": np.full(num, np.nan),
         "range_error_m": np.full(num, -0.02),
         "visible": np.ones(num, bool),
         "since_motion": np.arange(num),

@@ -95,6 +95,30 @@ def test_the_object_is_detected_identified_and_outlined() -> None:
     assert swapped.scores().result()["iou"] < 0.02
 
 
+def test_the_traced_box_is_compared_with_that_of_the_carrier(tmp_path: Path) -> None:
+    recording = synthetic.recording(3)
+    assert recording.truth is not None
+    carrier_px = np.array([[4.0, 6.0, 23.0, 25.0], [4.0, 6.0, 23.0, 35.0], [np.nan] * 4], np.float32)
+    truth = dataclasses.replace(recording.truth, carrier_box_px={"tag-a": carrier_px})
+    trace = Trace(
+        mask=jnp.zeros((2, synthetic.HEIGHT, synthetic.WIDTH)),
+        box_px=jnp.tile(jnp.array([4.0, 6.0, 13.0, 25.0]), (2, 1)),
+        centre_px=jnp.zeros((2, 2)),
+        centre_m=jnp.zeros((2, 3)),
+        step_m=jnp.zeros((2, 1)),
+        confidence=jnp.ones(2),
+        detected=jnp.ones(2, bool),
+    )
+    traces = [(number, trace) for number in range(3)]
+    result = score_traces(traces, dataclasses.replace(recording, truth=truth), EPCS)
+    np.testing.assert_allclose(result.frames["tag-a"].carrier_iou, [1 / 2, 1 / 3, np.nan])
+    assert np.isnan(result.frames["tag-b"].carrier_iou).all()
+    write_frames(tmp_path / "frames.csv", {"one": [result]})
+    with (tmp_path / "frames.csv").open() as file:
+        written = [row["carrier_iou"] for row in csv.DictReader(file) if row["epc"] == "tag-a"]
+    assert written == ["0.5", "0.333333", "nan"]
+
+
 def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
     recording = synthetic.recording(12)
     assert recording.truth is not None

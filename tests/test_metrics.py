@@ -209,6 +209,14 @@ def test_scores_select_frames_and_punish_missing_claims() -> None:
     assert result["time_to_identification_s"] is None  # never three frames in a row
 
 
+def test_the_carriers_overlap_is_averaged_where_the_carrier_is_known() -> None:
+    chosen = {"detected": [True, True, False, True], "carrier_iou": [0.8, np.nan, 0.9, 0.4]}
+    known = Scores.of(frame_scores(np.full(4, 0.1), **chosen)).result()
+    assert known["carrier_iou"] == pytest.approx((0.8 + 0.0 + 0.4) / 3)  # frame 2 is not detected
+    assert known["iou"] == pytest.approx(0.1 * 3 / 4)
+    assert Scores.of(frame_scores(np.full(4, 0.1))).result()["carrier_iou"] is None
+
+
 def test_merging_scores_equals_scoring_together() -> None:
     one = Scores.of(_frames([1.0, 0.8, 0.6, 0.4], [True] * 4, [2, 2, 2, 2]))
     two = Scores.of(_frames([0.0, 0.2, 0.1, 0.9, 0.3], [True] * 5, [2, 1, 1, 2, 2]))

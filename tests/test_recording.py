@@ -74,6 +74,7 @@ def _complete(recording: Recording) -> Recording:
         flow_px=np.ones((*shape, 2), np.float32),
         occluded=np.ones(shape, bool),
         boxes_px=np.ones((shape[0], 2, 4), np.float32),
+        carrier_box_px={"tag-a": np.arange(4.0 * shape[0], dtype=np.float32).reshape(-1, 4)},
     )
     reads = dataclasses.replace(
         recording.reads, reader_time_ns=recording.reads.time_ns + 5, channel_index=np.ones(count, np.int16)
@@ -87,6 +88,8 @@ def test_every_optional_part_makes_the_round_trip(recording, tmp_path):
     again = open_recording(tmp_path / "a.zarr")
     for name in ("labels", "flow_px", "occluded", "boxes_px"):
         np.testing.assert_array_equal(getattr(again.truth, name)[...], getattr(whole.truth, name))
+    assert list(again.truth.carrier_box_px) == ["tag-a"]
+    np.testing.assert_array_equal(again.truth.carrier_box_px["tag-a"], whole.truth.carrier_box_px["tag-a"])
     np.testing.assert_array_equal(again.reads.reader_time_ns, whole.reads.reader_time_ns)
     np.testing.assert_array_equal(again.reads.channel_index, whole.reads.channel_index)
 

@@ -156,6 +156,52 @@ def test_static_tags_are_read_but_not_labelled():
     assert len(recording.reads.epcs) >= 3  # far ones are too weak
 
 
+HELD = {"crowd": 12, "enter_leave": 2, "handheld": 1, "shop_exit": 1}
+"""Stories and the number of their tags on objects that one person holds from first to last; in the others it is none."""
+
+
+@pytest.mark.parametrize("name", STORIES)
+def test_a_held_object_has_the_holder_whose_limbs_it_stays_with(name):
+    world = _build(name, LONG_S.get(name, 3.0)).world
+    held = [world.bodies[tag.body] for tag in world.tags if world.bodies[tag.body].holder]
+    assert len(held) == HELD.get(name, 0)
+    for body in held:
+        limbs = [limb for limb in world.bodies if limb.name == body.holder and limb.role == "person"]
+        # One limb of the holder, the hand, keeps its distance from the object.
+        spread = [np.ptp(np.linalg.norm(limb.poses.position_m - body.poses.position_m, axis=1)) for limb in limbs]
+        others = [
+            np.ptp(np.linalg.norm(limb.poses.position_m - body.poses.position_m, axis=1))
+            for limb in world.bodies
+            if limb.role == "person" and limb.name != body.holder and limb.poses.moves
+        ]
+        assert min(spread) < 0.05
+        assert not others or min(others) > 2 * min(spread)
+
+
+def test_the_carriers_box_holds_the_person_and_all_that_the_person_holds():
+    scenario = _build("crowd", num_people=2, objects_each=2)
+    recording = simulate_recording(
+        scenario, dataclasses.replace(SMALL, width=128), seed=2, name="carried", num_frames=8
+    )
+    truth, world = recording.truth, scenario.world
+    assert truth is not None
+    assert truth.boxes_px is not None
+    assert set(truth.carrier_box_px) == {tag.epc for tag in world.tags}
+    one, other, third, _ = (truth.carrier_box_px[tag.epc] for tag in world.tags)
+    np.testing.assert_array_equal(one, other)  # one person's two hands
+    assert np.nanmax(np.abs(one - third)) > 5
+    larger = []
+    for tag in world.tags:
+        carrier_px, own_px = truth.carrier_box_px[tag.epc], truth.boxes_px[:, truth.tag_to_label[tag.epc] - 1]
+        shown = np.isfinite(own_px[:, 0])
+        assert (carrier_px[shown, :2] <= own_px[shown, :2]).all()
+        assert (carrier_px[shown, 2:] >= own_px[shown, 2:]).all()
+        size = [np.prod(box[shown, 2:] - box[shown, :2] + 1, axis=1) for box in (carrier_px, own_px)]
+        larger += list(size[0] / size[1])
+    assert len(larger) > 5
+    assert np.median(larger) > 4
+
+
 def test_tracks_are_at_the_given_distance():
     scenario = _build("tabletop", num_objects=2, tracks="parallel", spacing_m=0.164)
     one, other = (_object(scenario, number).poses.position_m for number in (0, 1))

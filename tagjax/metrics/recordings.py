@@ -186,6 +186,9 @@ def score_traces(
                 row["detected"] = bool(trace.detected[tag])
                 row["status"] = int(status[tag])
                 range_m = np.linalg.norm(np.asarray(trace.centre_m[tag], np.float64) - recording.antennas_m[0])
+                carrier_px = truth.carrier_box_px[epc][number] if epc in truth.carrier_box_px else np.full(4, np.nan)
+                known = bool(np.isfinite(carrier_px).all())
+                row["carrier_iou"] = float(box_iou(boxes[tag], carrier_px)) if known else float("nan")
                 row["range_error_m"] = float(range_m - _at(truth.tag_range_m, epc, number))
                 rows[epc].append(row)
         if number in kept:
@@ -251,7 +254,10 @@ def _tag_frames(
         visible &= np.asarray(truth.visible[label], bool)[part]
     reads, rssi_dbm = recent_reads(recording, epc)
     sight = np.asarray(truth.line_of_sight.get(epc, np.full(len(frame), np.nan)), np.float64)
-    columns = {name: np.array([row[name] for row in rows]) for name in ("iou", "cle_px", "mask_j", "range_error_m")}
+    columns = {
+        name: np.array([row[name] for row in rows])
+        for name in ("iou", "cle_px", "mask_j", "carrier_iou", "range_error_m")
+    }
     return FrameScores(
         time_s=time_s[part],
         **{name: values.astype(np.float64) for name, values in columns.items()},

@@ -42,6 +42,9 @@ class FrameScores:
     detected: Bool[np.ndarray, " time"]  # the tracer reports a detection
     status: Int8[np.ndarray, " time"]  # codes of `Status`: detected, or why not
     range_error_m: Float[np.ndarray, " time"]  # estimated less true range to the first antenna, NaN = unknown
+    carrier_iou: Float[
+        np.ndarray, " time"
+    ]  # of the box with that of the person who holds the object, NaN = no such truth
     visible: Bool[np.ndarray, " time"]  # the whole object is visible in the truth
     since_motion: Int[
         np.ndarray, " time"
@@ -82,6 +85,7 @@ def _columns(frames: FrameScores, threshold: float) -> dict[str, np.ndarray]:
         "cle_px": cle_px,
         "mask_j": mask_j,
         "identification": (detected & (frames.identified == frames.label)).astype(np.float64),
+        "carrier_iou": np.where(detected | np.isnan(frames.carrier_iou), frames.carrier_iou, 0.0),
         "success": (iou >= threshold).astype(np.float64),
         "success_auc": success_area(iou),
         "precision_20px": (np.nan_to_num(cle_px, nan=np.inf) <= PRECISION_PX).astype(np.float64),

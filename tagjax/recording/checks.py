@@ -32,7 +32,14 @@ def check_names(recording: Recording) -> None:
     epcs: Iterable[Any] = recording.reads.epcs
     if recording.truth is not None:
         truth = recording.truth
-        epcs = [*epcs, *truth.tag_to_label, *truth.tag_range_m, *truth.tag_position_m, *truth.line_of_sight]
+        tables = (
+            truth.tag_to_label,
+            truth.tag_range_m,
+            truth.tag_position_m,
+            truth.line_of_sight,
+            truth.carrier_box_px,
+        )
+        epcs = [*epcs, *(epc for table in tables for epc in table)]
     for epc in epcs:
         if (fault := name_fault(epc)) is not None:
             raise RecordingError(f"{recording.name}: an EPC: {fault}. Correct it in the source and import again.")
@@ -105,6 +112,7 @@ def check_truth(truth: Truth, name: str, num_frames: int, shape: tuple[int, int]
         ("tag_range_m", (num_frames,), "f"),
         ("tag_position_m", (num_frames, 3), "f"),
         ("line_of_sight", (num_frames,), "f"),
+        ("carrier_box_px", (num_frames, 4), "f"),
         ("visible", (num_frames,), "b"),
     ):
         for key, array in getattr(truth, field).items():

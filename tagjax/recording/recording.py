@@ -41,6 +41,8 @@ class Truth:
     backward_occluded: LazyArray | None = None  # (num_frames, height, width) bool: that flow's target is occluded
     line_of_sight: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames,)
     # fraction of the field that reaches the first antenna on the direct path: 1 free, 0 blocked
+    carrier_box_px: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # EPC: (num_frames, 4)
+    # x0 y0 x1 y1 (inclusive) around the person who holds the tagged object, and all that the person holds; NaN = not visible
 
     IGNORE = 255
 

@@ -26,7 +26,7 @@ FORMAT = "tagjax-recording"
 VERSION = 1
 
 _TRUTH_ARRAYS = ("labels", "flow_px", "occluded", "backward_flow_px", "backward_occluded")
-_TRUTH_TABLES = ("tag_range_m", "tag_position_m", "visible", "line_of_sight")
+_TRUTH_TABLES = ("tag_range_m", "tag_position_m", "visible", "line_of_sight", "carrier_box_px")
 _READ_SETTINGS = ("hop_table_hz", "phase_period_rad", "phase_sign", "pi_flips")
 _READ_COLUMNS = tuple(field.name for field in dataclasses.fields(TagReads) if field.name not in _READ_SETTINGS)
 
@@ -208,7 +208,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
     if attributes["truth"] is not None:
         tables: dict[str, dict[Any, np.ndarray]] = {}
         for name in _TRUTH_TABLES:
-            keys = attributes["truth"].get(name, ())  # older recordings have no line_of_sight
+            keys = attributes["truth"].get(name, ())  # older recordings have no line_of_sight and no carrier_box_px
             _check_unique(keys, f"truth.{name}", path)
             tables[name] = {key: array(f"truth/{name}/{number}")[...] for number, key in enumerate(keys)}
         truth = Truth(

@@ -27,6 +27,7 @@ Results = Mapping[str, Sequence[RecordingResult]]
 
 _COLUMNS = (
     "iou",
+    "carrier_iou",
     "cle_px",
     "mask_j",
     "identified",

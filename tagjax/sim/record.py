@@ -81,11 +81,13 @@ def simulate_recording(
     )
     steps = np.minimum(times / STEP_S, world.num_steps - 1)
     view = look_at(capture.intrinsics(), scenario.camera_position_m, scenario.camera_look_at_m)
-    frames, flow = _render(world, view, capture, steps, rng, on_frame)
+    people, person_of_body = carriers(world)
+    frames, flow = _render(world, view, capture, steps, rng, on_frame, person_of_body)
     reads, clock, sight = _read_tags(scenario, seed)
     antennas = view.to_camera(np.asarray(scenario.antennas_m, float))
     position = {tag.epc: _at_steps(view.to_camera(tag_path(world, tag)), steps) for tag in world.tags}
     labels = frames["labels"]
+    carrier_boxes = mask_boxes(frames["carriers"], len(people))
     num_labels = max((body.label for body in world.bodies), default=0)
     return Recording(
         colour=frames["colour"],
@@ -102,6 +104,11 @@ def simulate_recording(
             tag_range_m={epc: np.linalg.norm(path - antennas[0], axis=1) for epc, path in position.items()},
             tag_position_m=position,
             visible={label: np.any(labels == label, axis=(1, 2)) for label in range(1, num_labels + 1)},
+            carrier_box_px={
+                tag.epc: carrier_boxes[:, people.index(holder)]
+                for tag in world.tags
+                if (holder := world.bodies[tag.body].holder)
+            },
             line_of_sight={epc: _at_steps(kept[:, None], steps)[:, 0] for epc, kept in sight.items()},
             **flow,
         ),
@@ -117,14 +124,18 @@ def _render(
     steps: np.ndarray,
     rng: np.random.Generator,
     on_frame: Callable[[], None] | None,
+    person_of_body: np.ndarray,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Colour, depth and labels of every frame, and the fields of `Truth` that hold exact flow (none unless asked for)."""
+    """Colour, depth, labels and carriers of every frame, and the fields of `Truth` that hold exact flow (none unless asked for).
+
+    Carriers are pictures of `person_of_body` at the body that each pixel shows.
+    """
     from .rendering.raycast import Raycaster
     from .rendering.shading import Shader
 
     raycaster = Raycaster(world)
     shader, sensor, lamp = Shader(raycaster), SENSORS[capture.sensor], ILLUMINATION[capture.illumination]
-    frames: dict[str, list[np.ndarray]] = {"colour": [], "depth": [], "labels": []}
+    frames: dict[str, list[np.ndarray]] = {"colour": [], "depth": [], "labels": [], "carriers": []}
     flows = []
     previous: Hits | None = None
     exposure = 0.0
@@ -141,6 +152,8 @@ def _render(
         frames["colour"].append(lamp.expose(light, rng, exposure=exposure))
         frames["depth"].append(sensor.measure(hits, surface.reflectance, surface.shine, rng))
         frames["labels"].append(raycaster.labels(hits))
+        shown = person_of_body[raycaster.geom_body[np.maximum(hits.geom, 0)]]
+        frames["carriers"].append(np.where(hits.geom >= 0, shown, 0))
         if capture.flow and previous is not None:
             flows.append(flow_between(previous, hits))
         previous = hits
@@ -158,6 +171,16 @@ def _render(
         "backward_flow_px": np.stack([missing, *(flow.backward_px for flow in flows)]),
         "backward_occluded": np.stack([nothing, *(flow.backward_occluded for flow in flows)]),
     }
+
+
+def carriers(world: World) -> tuple[list[str], np.ndarray]:
+    """Names of the people who hold an object throughout, and for each body the number of its person (from 1), uint8.
+
+    What a person holds is part of the carrier, as its limbs are. Other bodies have 0.
+    """
+    people = list(dict.fromkeys(body.holder for body in world.bodies if body.holder))
+    owners = [body.name if body.role == "person" else body.holder for body in world.bodies]
+    return people, np.array([people.index(owner) + 1 if owner in people else 0 for owner in owners], np.uint8)
 
 
 def mask_boxes(labels: np.ndarray, num_labels: int) -> np.ndarray:

@@ -46,8 +46,7 @@ class ScenarioBuilder:
 
         With a `badge` the person wears a tag on the chest and has a label: the person is what is to be tracked.
         """
-        number = len({body.name for body in self.bodies if body.role == "person"})
-        name, motion = f"person {number + 1}", move_person(model, walk, hands)
+        name, motion = f"person {self.num_people + 1}", move_person(model, walk, hands)
         label = 0 if badge is None else len(self.names) + 1
         limbs = limb_bodies(model, motion, label=label, name=name)
         if badge is not None:
@@ -57,11 +56,19 @@ class ScenarioBuilder:
         self.bodies += limbs
         return motion
 
-    def object(self, model: ObjectModel, poses: Poses, *, tagged: bool = True, labelled: bool = True) -> None:
+    @property
+    def num_people(self) -> int:
+        return len({body.name for body in self.bodies if body.role == "person"})
+
+    def object(
+        self, model: ObjectModel, poses: Poses, *, tagged: bool = True, labelled: bool = True, held: bool = False
+    ) -> None:
+        """Add an object. With `held` the person added last holds it from the first step to the last."""
         label = len(self.names) + 1 if labelled else 0
+        holder = f"person {self.num_people}" if held else ""
         if labelled:
             self.names[label] = model.name
-        self.bodies.append(Body(model.name, model.shapes, poses, "object", label))
+        self.bodies.append(Body(model.name, model.shapes, poses, "object", label, holder))
         if tagged:
             self.tags.append(Tag(default_epc(len(self.tags) + 1), len(self.bodies) - 1, model.tag_m, model.dipole))
 

@@ -52,7 +52,7 @@ def enter_leave(
         model = make_object(str(rng.choice(CARRIED_KINDS)), rng)
         hands = Hands(right=_hand(walk, room, rng, duration_s))
         motion = builder.person(make_person(rng), walk, hands)
-        builder.object(model, carried_poses(motion.right_hand, model.grip_m))
+        builder.object(model, carried_poses(motion.right_hand, model.grip_m), held=True)
     scenario = builder.scenario(f"{num_people} people enter through a door and leave through it")
     _check(scenario)
     return scenario

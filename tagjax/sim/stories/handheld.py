@@ -88,10 +88,10 @@ def handheld(
             _add_bundle(builder, mine, motion.right_hand)
         else:
             for model, hand in zip(mine, (motion.right_hand, motion.left_hand), strict=False):
-                builder.object(model, carried_poses(hand, model.grip_m))
+                builder.object(model, carried_poses(hand, model.grip_m), held=True)
         if notebook_occluder:
             notebook = make_object("notebook", rng, scale=1.25)
-            builder.object(notebook, _facing_camera(notebook, motion.left_hand, camera), tagged=False)
+            builder.object(notebook, _facing_camera(notebook, motion.left_hand, camera), tagged=False, held=True)
     add_walkers(builder, rng, num_walkers, duration_s, places)
     add_static_tags(builder, rng, num_static_tags, within_m=_NEAR_M)
     middle = np.mean(places, axis=0)
@@ -115,7 +115,7 @@ def _add_bundle(builder: ScenarioBuilder, models: Sequence[ObjectModel], hand: P
     for number, model in enumerate(models):
         if number:
             reach += models[number - 1].half_size_m[1] + model.half_size_m[1] + 0.005
-        builder.object(model, Poses(first.position_m + turn @ np.array([0.0, reach, 0.0]), first.quaternion))
+        builder.object(model, Poses(first.position_m + turn @ np.array([0.0, reach, 0.0]), first.quaternion), held=True)
 
 
 def _occluding_hand(walk: Walk, object_m: np.ndarray, camera_m: Sequence[float], duration_s: float) -> np.ndarray:

@@ -212,7 +212,7 @@ def _add_customer(builder: ScenarioBuilder, rng: np.random.Generator, walk: Walk
         model = make_object(str(rng.choice(KINDS)), rng, scale=0.8)
         pose = carried_poses((motion.right_hand, motion.left_hand)[number % 2], model.grip_m)
         lift = _lift(held[number - 2], model) if number > 1 else 0.0
-        builder.object(model, Poses(pose.position_m + np.array([0.0, 0.0, lift]), pose.quaternion))
+        builder.object(model, Poses(pose.position_m + np.array([0.0, 0.0, lift]), pose.quaternion), held=True)
         held.append(model)
 
 

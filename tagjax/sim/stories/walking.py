@@ -45,7 +45,7 @@ def approach(
     else:
         model = make_object(kind, rng)
         motion = builder.person(person, walk, Hands(right=hand_target(walk, (0.26, -0.16, 1.0))))
-        builder.object(model, carried_poses(motion.right_hand, model.grip_m))
+        builder.object(model, carried_poses(motion.right_hand, model.grip_m), held=True)
     return builder.scenario(
         f"a person walks back and forth at {speed_m_s} m/s", look_at_m=((near + far) / 2, 0.5 * y, 0.95)
     )
@@ -115,7 +115,7 @@ def crowd(
         motion = builder.person(person, walk, hands)
         for hand in (motion.right_hand, motion.left_hand)[:objects_each]:
             model = make_object(str(rng.choice(CARRIED_KINDS)), rng)
-            builder.object(model, carried_poses(hand, model.grip_m))
+            builder.object(model, carried_poses(hand, model.grip_m), held=True)
     add_static_tags(builder, rng, num_static_tags)
     return builder.scenario(f"{num_people} people walk, {objects_each} objects each")
 

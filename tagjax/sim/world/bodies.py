@@ -77,7 +77,8 @@ class Poses:
 class Body:
     """Shapes that move together (a limb, an object, a table). `label` is the value in the label masks, 0 for the room.
 
-    All limbs of a person have the same `name`, and the same label if the person is labelled.
+    All limbs of a person have the same `name`, and the same label if the person is labelled. `holder` is the name of the
+    person who holds an object from the first step to the last, empty where no one does.
     """
 
     name: str
@@ -85,6 +86,7 @@ class Body:
     poses: Poses
     role: Role = "room"
     label: int = 0
+    holder: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
