@@ -56,8 +56,9 @@ class Reader:
         own = concentration * (np.cos(angle) + 1j * np.sin(angle))
         before, after = np.abs(phasor), np.abs(phasor + own)
         product, both = phasor * np.conj(own), before * concentration
-        agree = product.real > 0
-        apart = np.where(agree, np.square(product.imag) / np.where(agree, both + product.real, 1), both - product.real)
+        along, across = np.real(product), np.imag(product)
+        agree = along > 0
+        apart = np.where(agree, np.square(across) / np.where(agree, both + along, 1), both - along)
         lost = 2 * apart / (after + before + concentration)
         ratio = np.exp(-lost) * i0e(after) / (i0e(before) * i0e(concentration))
         outlier = self.value["outlier"]

@@ -139,7 +139,7 @@ def twin_times_ms(camera: Camera, frames: list[Frame], *, with_masks: bool) -> t
     """Median times of a step (without the flow) of the tracer and of its NumPy twin, whose frames alternate, ms."""
     tracer = TagAttention()
     state = eqx.filter_jit(tracer.init)(camera, frames[0])
-    num_tags = len(state.tags.num_reads)
+    num_tags = len(state.tags.recent.number)
     twin, ours, theirs = NumpyTracer(tracer, camera, num_tags), [], []
     for frame in frames:
         begun = time.perf_counter()
