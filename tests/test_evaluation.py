@@ -98,11 +98,11 @@ def test_the_object_is_detected_identified_and_outlined() -> None:
 def test_the_traced_box_is_compared_with_that_of_the_carrier(tmp_path: Path) -> None:
     recording = synthetic.recording(3)
     assert recording.truth is not None
-    carrier_px = np.array([[4.0, 6.0, 23.0, 25.0], [4.0, 6.0, 23.0, 35.0], [np.nan] * 4], np.float32)
+    carrier_px = np.array([[4.0, 2.0, 23.0, 11.0], [4.0, 2.0, 23.0, 16.0], [np.nan] * 4], np.float32)
     truth = dataclasses.replace(recording.truth, carrier_box_px={"tag-a": carrier_px})
     trace = Trace(
         mask=jnp.zeros((2, synthetic.HEIGHT, synthetic.WIDTH)),
-        box_px=jnp.tile(jnp.array([4.0, 6.0, 13.0, 25.0]), (2, 1)),
+        box_px=jnp.tile(jnp.array([4.0, 2.0, 13.0, 11.0]), (2, 1)),
         centre_px=jnp.zeros((2, 2)),
         centre_m=jnp.zeros((2, 3)),
         step_m=jnp.zeros((2, 1)),
