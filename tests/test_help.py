@@ -6,6 +6,7 @@ import importlib
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from hydra.plugins.sweeper import Sweeper
 from omegaconf import OmegaConf
 
 from experiments.help import command_help
+from tagjax import cli
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = sorted(path.stem for path in CONF.glob("*.yaml"))
@@ -32,6 +34,12 @@ def _keys(values: object, depth: int = 0) -> list[str]:
     if not isinstance(values, dict):
         return []
     return [line for key, value in values.items() for line in (f"{'  ' * depth}{key}:", *_keys(value, depth + 1))]
+
+
+def test_every_command_is_a_console_command_of_the_wheel() -> None:
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {f"tagjax-{name.replace('_', '-')}": f"tagjax.cli:{name}" for name in COMMANDS}
+    assert all(callable(getattr(cli, name)) for name in COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
