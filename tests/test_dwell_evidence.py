@@ -38,11 +38,11 @@ def _log_i0(x):
 class Twin:
     """The same likelihood in float64 with complex phasors of absolute distances, read by read and slot by slot."""
 
-    def __init__(self, num_tags, num_antennas, num_segments, reader: ReaderModel, memory_s: float, newborn_nats: float):
+    def __init__(self, num_tags, num_antennas, num_segments, reader: ReaderModel, memory_s: float):
         rows = (num_tags, num_antennas, num_segments)
         self.phasor, self.read, self.distance = np.zeros(rows, complex), np.zeros(rows), np.zeros(rows[1:])
         self.evidence, self.channel = np.zeros((num_tags, num_segments)), np.full(rows[:2], -1)
-        self.reader, self.memory_s, self.newborn_nats = reader, memory_s, newborn_nats
+        self.reader, self.memory_s = reader, memory_s
 
     def step(self, reads, increment, source, since, now):
         old = [part.copy() for part in (self.phasor, self.read, self.distance, self.evidence)]
@@ -53,7 +53,7 @@ class Twin:
         increment = np.where(np.arange(increment.shape[1]) == 0, 0.0, increment)
         self.evidence *= np.exp(-(now - since) / self.memory_s)
         for slot in [slot for slot, one in enumerate(source) if slot and one in (-1, 0)]:
-            self.evidence[:, slot] = np.maximum(self.evidence[:, slot], -self.newborn_nats)
+            self.evidence[:, slot] = np.maximum(self.evidence[:, slot], 0)
         m, q = (2 if self.reader.modulo_pi else 1), float(self.reader.outlier.value)
         for tag, antenna, time_s, phase, carrier, channel, rssi in reads:
             at = self.distance[antenna] + (time_s - since) / (now - since) * increment[antenna]
@@ -129,8 +129,8 @@ def _run(frames, evidence, reader, num_tags=3, num_antennas=2, **buffer):
 def test_the_evidence_is_the_twins(modulo_pi):
     frames, reader = _frames(np.random.default_rng(0)), ReaderModel(modulo_pi=modulo_pi)
     assert sum(len(frame[0]) for frame in frames) == 100
-    evidence = DwellEvidence(memory_s=0.5, newborn_nats=3.0)
-    twin = Twin(3, 2, NUM_SEGMENTS, reader, float(evidence.memory_s.value), evidence.newborn_nats)
+    evidence = DwellEvidence(memory_s=0.5)
+    twin = Twin(3, 2, NUM_SEGMENTS, reader, float(evidence.memory_s.value))
     expected = np.stack([twin.step(*frame).copy() for frame in frames])
     state, ours = _run(frames, evidence, reader)
     assert np.ptp(expected[-1]) > 10  # the segments differ in what they explain
@@ -282,14 +282,17 @@ def test_newborn_segments_inherit_from_the_last_frame():
     slots = np.arange(NUM_SEGMENTS)
     slots[[3, 4, 5]] = [7, 3, 0]  # 4 has what 3 was; 0 is never newborn
     for name in ("real", "imaginary", "read_m", "distance_m", "log_likelihood"):
-        np.testing.assert_allclose(getattr(after, name), np.asarray(getattr(state, name))[..., slots], rtol=1e-6)
+        expected = np.array(getattr(state, name))[..., slots]
+        if name == "log_likelihood":
+            expected[:, 5] = np.maximum(expected[:, 5], 0.0)  # out of the background
+        np.testing.assert_allclose(getattr(after, name), expected, rtol=1e-6)
     np.testing.assert_array_equal(found, after.log_likelihood)
 
 
 @pytest.mark.parametrize("num_existing", [0, 7])
-def test_what_comes_into_view_has_no_less_evidence_than_the_probability_of_that(num_existing):
-    """Of the background's evidence against it only so much counts; evidence for it counts whole, and so does a mover's past."""
-    evidence, num_segments = DwellEvidence(memory_s=2.0, newborn_nats=15.0), 600
+def test_nothing_speaks_against_what_comes_into_view(num_existing):
+    """The background's evidence against a tag does not count for it; evidence for it does, and so does a mover's past."""
+    evidence, num_segments = DwellEvidence(memory_s=2.0), 600
     of_slots = np.zeros((2, num_segments))
     of_slots[0, :4], of_slots[1, :4] = [-400.0, -90.0, -50.0, -60.0], [40.0, -90.0, -50.0, -60.0]
     state = DwellState.nothing(2, 1, num_segments)
@@ -302,7 +305,7 @@ def test_what_comes_into_view_has_no_less_evidence_than_the_probability_of_that(
         jnp.asarray(source, jnp.int32), now_s - 0.5, now_s, jnp.asarray(exists),
     )  # fmt: skip
     kept = np.exp(-0.25)
-    expected = [[-400 * kept, -90 * kept, -50 * kept, -15, -15, -90 * kept, -15], [40 * kept, -90 * kept, -50 * kept]]
+    expected = [[-400 * kept, -90 * kept, -50 * kept, 0, 0, -90 * kept, 0], [40 * kept, -90 * kept, -50 * kept]]
     expected[1] += [40 * kept, 40 * kept, -90 * kept, 40 * kept]
     np.testing.assert_allclose(found[:, :7], expected, rtol=1e-5)
 

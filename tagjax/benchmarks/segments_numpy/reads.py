@@ -73,7 +73,6 @@ class Dwells:
         self, settings: original.DwellEvidence, model: ReaderModel, num_tags: int, num_antennas: int, num: int
     ) -> None:
         self.reader, self.memory_s = Reader(model), np.float32(settings.memory_s.value)
-        self.newborn_nats = np.float32(settings.newborn_nats)
         self.phasor = np.zeros((num_tags, num_antennas, num), np.complex64)
         self.read_m = np.zeros((num_tags, num_antennas, num), np.float32)
         self.distance_m = np.zeros((num_antennas, num), np.float32)
@@ -98,7 +97,7 @@ class Dwells:
             table[..., new] = table[..., old]
         self.log_likelihood *= np.exp(-(now_s - since_s) / self.memory_s)
         unknown = new[source[new] <= 0]
-        self.log_likelihood[:, unknown] = np.maximum(self.log_likelihood[:, unknown], -self.newborn_nats)
+        self.log_likelihood[:, unknown] = np.maximum(self.log_likelihood[:, unknown], 0)
         before = self.log_likelihood.copy()
         increment_m = increment_m.copy()
         increment_m[:, 0] = 0

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ...core.constrained import Positive
-from ...core.parameters import check_positive
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
 from .cells import row_sources
@@ -64,29 +63,10 @@ class DwellEvidence(eqx.Module):
     """Evidence of the reads for each (tag, segment), forgotten with a time constant."""
 
     memory_s: Positive  # evidence decays as exp(-age / memory); scores change little from 2 to 6 s
-    newborn_nats: float = eqx.field(static=True)  # what comes out of the background begins with minus this at least
 
-    def __init__(self, *, memory_s: float = 4.0, newborn_nats: float = 15.0) -> None:
-        """Raises `ValueError` for a value that is not positive."""
-        check_positive(newborn_nats=newborn_nats)
-        self.memory_s, self.newborn_nats = Positive(memory_s), float(newborn_nats)
-
-    def inherited(
-        self,
-        log_likelihood: Float[Array, "tag some"],
-        newborn_source: Int[Array, " some"],
-        slots: Int[Array, " some"] | None = None,
-    ) -> Float[Array, "tag some"]:
-        """The evidence with which a frame begins, of that of each segment's source.
-
-        A segment from slot 0 or from nowhere was at rest there, or it comes into view: through a door, from behind
-        something. What it did before is then unknown, and reads of that time say nothing against it. So of a moving tag,
-        to which the background's evidence is very negative, it has no less than -`newborn_nats`, the logarithm of the
-        probability that it comes into view. `slots` are the segments, all if None.
-        """
-        slots = jnp.arange(newborn_source.shape[0]) if slots is None else slots
-        unknown = (newborn_source > -2) & (newborn_source <= STATIC) & (slots != STATIC)
-        return jnp.where(unknown[None], jnp.maximum(log_likelihood, -self.newborn_nats), log_likelihood)
+    def __init__(self, *, memory_s: float = 4.0) -> None:
+        """Raises `ValueError` for a memory that is not positive."""
+        self.memory_s = Positive(memory_s)
 
     def step(
         self,
@@ -105,7 +85,7 @@ class DwellEvidence(eqx.Module):
         `arrivals` are the reads in (since_s, now_s], in order of time; `increment_m` is what each segment's distance to
         each antenna has grown since the frame at `since_s`, linearly in time, and `depth_m` its z. `newborn_source` is -2
         for a segment that goes on; a newborn one inherits evidence and phasors of this slot as it was at the last frame, -1
-        those of slot 0; see `inherited` for both. Cost: reads x segments, and one copy of the state for the newborn segments. Slots that do not exist
+        those of slot 0, both as `inherited` says. Cost: reads x segments, and one copy of the state for the newborn segments. Slots that do not exist
         may be left out of the reads, because nothing but a newborn segment will be there; with `exists` None, or nowhere,
         all take part.
         """
@@ -171,14 +151,14 @@ class DwellEvidence(eqx.Module):
 
         def of_all() -> tuple[_Rows, Array, Array]:
             tables, before = jax.tree.map(lambda rows: _taken(rows, source), of_tags)
-            return scanned((tables, self.inherited(before, newborn_source)), last_m, increment_m, depth_m)
+            return scanned((tables, inherited(before, newborn_source)), last_m, increment_m, depth_m)
 
         def of_those(exists: Bool[Array, " segment"]) -> tuple[_Rows, Array, Array]:
             (slots,) = jnp.nonzero(exists, size=_FEW, fill_value=shape[-1])
             tables, before = jax.tree.map(lambda rows: _taken(rows, _taken(source, slots)), of_tags)
-            inherited = tables, self.inherited(before, _taken(newborn_source, slots), slots)
+            before = inherited(before, _taken(newborn_source, slots), slots)
             columns = (_taken(rows, slots) for rows in (last_m, increment_m, depth_m))
-            *changed, channel = scanned(inherited, *columns)
+            *changed, channel = scanned((tables, before), *columns)
             put = lambda rows, own: rows.at[:, slots].set(own, mode="drop", indices_are_sorted=True)  # noqa: E731
             return (*jax.tree.map(put, of_tags, tuple(changed)), channel)
 
@@ -192,6 +172,22 @@ class DwellEvidence(eqx.Module):
         distance_m = last_m + increment_m
         after = DwellState(real, imaginary, read_m, distance_m, channel.reshape(shape[:2]), log_likelihood)
         return after, log_likelihood
+
+
+def inherited(
+    log_likelihood: Float[Array, "tag some"],
+    newborn_source: Int[Array, " some"],
+    slots: Int[Array, " some"] | None = None,
+) -> Float[Array, "tag some"]:
+    """The evidence with which a frame begins, of that of each segment's source.
+
+    A segment from slot 0 or from nowhere was at rest there, or it comes into view: through a door, from behind something.
+    What it did before is then unknown, so reads of that time say nothing against it. Evidence for a tag at rest is kept.
+    `slots` are the segments, all if None.
+    """
+    slots = jnp.arange(newborn_source.shape[0]) if slots is None else slots
+    unknown = (newborn_source > -2) & (newborn_source <= STATIC) & (slots != STATIC)
+    return jnp.where(unknown[None], jnp.maximum(log_likelihood, 0.0), log_likelihood)
 
 
 def _in_chunks(reads: tuple[Arrivals, Array, Array]) -> tuple[Arrivals, Array, Array]:

@@ -31,7 +31,7 @@ from .body import BodyState, CarryingBody, LaterBody
 from .cells import row_sources
 from .cut import cut_segments
 from .detection import Detection, RecentReads
-from .dwell import DwellEvidence, DwellState
+from .dwell import DwellEvidence, DwellState, inherited
 from .given import without_joined
 from .hidden import HiddenBody, HiddenState
 from .hindsight import Hindsight
@@ -279,7 +279,7 @@ class TagAttention(AbstractSmoother):
         evidence = added = jnp.zeros((frame.present.shape[0], found.area.shape[0]))
         if self.dwell is not None and dwell is not None:
             before = jnp.exp(-dt_s / self.dwell.memory_s.value) * jnp.take(dwell.log_likelihood, source, axis=1)
-            before = self.dwell.inherited(before, found.source)
+            before = inherited(before, found.source)
             dwell, evidence = self.dwell.step(
                 self.reader, dwell, frame.arrivals, found.increment_m, found.centre_m[:, 2], found.source,
                 since_s, now_s, found.area > 0,
