@@ -21,7 +21,7 @@ from tagjax.flow.stationary import is_moving, zero_stationary
 from tagjax.flow.weights import load_network, save_weights
 from tagjax.recording import Recording
 from tagjax.recording.store import save_recording
-from tagjax.tagattention import TagAttention
+from tagjax.tagattention.literal import TagAttentionLiteral
 from tagjax.tracing.clips import Clip, load_clip
 from tagjax.training.config import TrainConfig
 from tagjax.training.joint import JointModel, network_flow
@@ -104,18 +104,16 @@ def _in_double(tree):
 
 @pytest.mark.ci
 def test_the_loss_moves_as_its_gradient_says(clip):
-    """Flow weights, alpha, beta, v0 and the gate's width through one objective, against central differences in x64."""
+    """Flow weights, alpha, beta and v0 through one objective, against central differences in x64."""
     with jax.enable_x64(True):
-        # By design no gradient goes through the place of a frame ago, the centre that mean shift finds, or how far rivalry
-        # counts: the prior that reads the first, the extent around the second and rivalry are left out here.
-        left_out = {"prior_weight": 1e-12, "extent_m": 1e3, "rivalry": 1e-12}
-        tracer = TagAttention(cell=4, v0_m_s=0.3, gate_width_m_s=0.1, **left_out)
-        model = _in_double(JointModel(tracer, _panning_network(), 0.1, LOSS))
+        # The paper's chain, relaxed: the present tracer has its own test, and takes minutes to compile here.
+        tracer = TagAttentionLiteral(cell=4, softness=0.3, v0_m_s=0.3)
+        # The network's own loss weighs next to nothing: what is left is what the reads teach it.
+        model = _in_double(JointModel(tracer, _panning_network(), 1e-6, LOSS))
         frames, camera = _in_double(clip.frames), _in_double(clip.camera)
         slope = jnp.linspace(0.0, 0.6, frames.depth_m.shape[2])
         frames = eqx.tree_at(lambda f: f.depth_m, frames, frames.depth_m + slope.reshape(1, 1, -1))
-        each = dataclasses.replace(OBJECTIVE, term_norms=True)
-        gradient, logged = clip_gradient(model, camera, frames, KEY, each)
+        gradient, logged = clip_gradient(model, camera, frames, KEY, OBJECTIVE)
         loss = lambda model: float(clip_loss(model, camera, frames, KEY, OBJECTIVE)["loss"])  # noqa: E731
         assert float(logged["loss"]) == pytest.approx(loss(model), rel=1e-9)
         rng = np.random.default_rng(5)
@@ -134,14 +132,12 @@ def test_the_loss_moves_as_its_gradient_says(clip):
         numeric = (loss(along(step)) - loss(along(-step))) / (2 * step)
         assert abs(predicted) > 1e-4
         assert predicted == pytest.approx(numeric, rel=1e-3)
-        for name in ("log_alpha", "logit_beta", "log_v0", "log_gate_width"):
+        for name in ("alpha_m2", "beta", "v0_m_s"):
             where = lambda m, name=name: getattr(m.tracer, name)  # noqa: E731
             ends = [loss(eqx.tree_at(where, model, where(model) + sign * step)) for sign in (1, -1)]
             numeric = (ends[0] - ends[1]) / (2 * step)
             assert abs(numeric) > 1e-7, name
             assert float(where(gradient)) == pytest.approx(numeric, rel=1e-3), name
-        # The reads teach the network as well, not only its own loss.
-        assert float(logged["gradient_norm/contrast/flow"]) > 0
 
 
 def test_a_clip_without_pictures_is_refused():
@@ -169,7 +165,7 @@ def test_a_joint_run_learns_both_resumes_exactly_and_is_evaluated_with_its_own_f
     for seed, path in enumerate(paths):
         save_recording(_panned(24, seed=seed, name=f"scene{seed}"), path)
     values = {
-        "tracer": {"_target_": "tagjax.tagattention.TagAttention", "cell": 4},
+        "tracer": {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "cell": 4, "softness": 0.3},
         "optimizer": {"_target_": "optax.adam", "learning_rate": 0.01},
         "joint": {
             "flow": {"_target_": "tagjax.flow.pyramid.PyramidFlow", **small},
