@@ -33,11 +33,11 @@ class Case:
 
 
 CASES = {
-    "walking people": Case("walkers", (), ("weights=default",)),
+    "walking people": Case("walkers", (), ("tracer=tagattention",)),
     "hand-held object": Case(
         "single_static",
         ("duration_s=3.5", "variants=[{name: box, settings: {kinds: [box]}}]"),
-        ("tracer=tagattention_handheld", "clips.stride=2"),
+        ("tracer=tagattention",),
     ),
 }
 

@@ -9,8 +9,6 @@ from tagjax.tagattention.propagation import (
     log_likelihood_ratio,
     propagate,
     radio_speed,
-    rival_log_odds,
-    soft_clip,
     velocity_gate,
 )
 
@@ -101,31 +99,3 @@ def test_evidence_is_log_attention_against_background_1():
     a = jnp.asarray([0.2, 0.9])
     out = log_likelihood_ratio(a, jnp.asarray(1.0), jnp.asarray(1e-7))
     np.testing.assert_allclose(out, np.log([0.2, 0.9]), rtol=1e-5)
-
-
-def test_soft_clip_bounds_and_leaves_small_values():
-    np.testing.assert_allclose(soft_clip(jnp.asarray(0.01), jnp.asarray(10.0)), 0.01, rtol=1e-5)
-    assert float(soft_clip(jnp.asarray(1e4), jnp.asarray(10.0))) <= 10.0
-
-
-def test_rivals_make_log_odds_those_of_one_tag_among_all():
-    """Against NumPy: tag k against background and the other tags, each of odds exp(l) - 1 where that is positive."""
-    log_odds = np.random.default_rng(1).normal(1.0, 3.0, (4, 2, 3)).astype(np.float32)
-    out = rival_log_odds(jnp.asarray(log_odds))
-    odds = np.expm1(np.maximum(log_odds.astype(np.float64), 0.0))
-    for k in range(4):
-        np.testing.assert_allclose(out[k], np.log1p(np.delete(odds, k, axis=0).sum(axis=0)), rtol=1e-5, atol=1e-6)
-
-
-def test_a_tag_alone_and_tags_of_which_nothing_is_known_have_no_rival():
-    assert float(jnp.abs(rival_log_odds(jnp.full((1, 2, 2), 9.0))).max()) == 0.0
-    other = jnp.stack([jnp.full((2, 2), 5.0), jnp.zeros((2, 2)), jnp.full((2, 2), -7.0)])
-    np.testing.assert_allclose(rival_log_odds(other)[0], 0.0)
-    np.testing.assert_allclose(rival_log_odds(other)[1], 5.0, rtol=1e-5)
-
-
-def test_rivals_of_any_odds_have_finite_gradients():
-    extreme = jnp.asarray([0.0, -500.0, 500.0, 1e-30])[:, None, None]
-    gradient = jax.grad(lambda given: jnp.sum(rival_log_odds(given)))(extreme)
-    assert bool(jnp.isfinite(gradient).all())
-    assert bool(jnp.isfinite(rival_log_odds(extreme)).all())

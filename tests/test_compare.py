@@ -171,9 +171,8 @@ def test_goller_takes_a_calibration_that_was_fitted(monkeypatch: pytest.MonkeyPa
     systems = Systems(settings, config.scores)
     found = systems._goller(recording).calibration
     np.testing.assert_allclose(found.association.log_speed_m_s, np.log(0.123), rtol=1e-5)
-    item = Item(from_mapping(Suite, config.suites["shop_exit"]), Variant("all"), "test", 0, 1)
-    assert systems.settings_label("goller", item) == "fitted widths"
-    assert Systems(config.systems, config.scores).settings_label("goller", item) == "starting widths"
+    assert systems.settings_label("goller") == "fitted widths"
+    assert Systems(config.systems, config.scores).settings_label("goller") == "starting widths"
     wrong = dataclasses.replace(settings, goller_calibration=str(tmp_path / "none.json"))
     with pytest.raises(ConfigError, match=r"systems\.goller_calibration: .*none\.json.*experiments\.goller"):
         run_comparison(

@@ -21,16 +21,14 @@ from experiments.suites import suites_named
 from tagjax.baselines.goller.experiment import GollerExperiment
 from tagjax.baselines.tagview.experiment import TagviewExperiment
 from tagjax.baselines.tagview.matching import MatchSettings
-from tagjax.core.settings import ConfigError, from_mapping
-from tagjax.evaluation.compare import SystemSettings
+from tagjax.core.settings import from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.run import EvaluateConfig
 from tagjax.evaluation.sweep import SweepConfig
 from tagjax.flow.network import AbstractFlowNetwork
 from tagjax.metrics.recordings import ScoreSettings
-from tagjax.sim.suites import PLANAR, Suite
 from tagjax.tagattention import TagAttention
-from tagjax.tagattention.tracer_settings import make_tracer, tracer_clips
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.tracing.tracer import AbstractTracer
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_config import TrainFlowConfig
@@ -57,13 +55,6 @@ def test_every_training_configuration_is_valid(override: str) -> None:
     for baseline in config.baselines.values():
         assert isinstance(make_tracer(baseline), AbstractTracer)
     assert config.objective.weights()
-
-
-@pytest.mark.parametrize("experiment", ["handheld", "handheld_from_people"])
-def test_hand_held_objects_are_learned_at_the_resolution_of_their_tracer(experiment: str) -> None:
-    config = settings(TrainConfig, "train", f"experiment={experiment}")
-    assert config.data.clips.stride is None
-    assert config.data.clips.stride == tracer_clips(composed("train", "tracer=tagattention_handheld")["tracer"]).stride
 
 
 @pytest.mark.parametrize(
@@ -105,11 +96,11 @@ def test_evaluation_configurations_are_valid() -> None:
 def test_a_sweep_sees_the_clips_of_its_tracer() -> None:
     suites = {"suites": suites_named(["velocity_threshold"])}
     estimators = {"tagattention_published": "published", "tagattention": "robust"}
-    for tracer, stride in (("tagattention_published", None), ("tagattention", 4)):
-        values = composed("sweep_paper", f"tracer={tracer}")
+    for tracer, parameter in (("tagattention_published", "v0_m_s"), ("tagattention", "dwell.memory_s")):
+        values = {**composed("sweep_paper", f"tracer={tracer}"), "grid": {parameter: [0.1]}}
         values.pop("progress")
         clips = from_mapping(SweepConfig, {**values, **suites}).clip_settings()
-        assert (clips.stride, clips.estimator) == (stride, estimators[tracer])
+        assert (clips.stride, clips.estimator) == (None, estimators[tracer])
 
 
 def test_flow_evaluation_configurations_are_valid() -> None:
@@ -136,8 +127,7 @@ def test_the_comparison_takes_each_system_as_its_own_experiments_do() -> None:
     complete = from_mapping(MatchSettings, view["system"]["match"])
     for name, change in (("no_rssi", {"mu": 0.0}), ("camera_origin", {"origin": "principal"})):
         assert from_mapping(MatchSettings, view["matching"][name]["match"]) == dataclasses.replace(complete, **change)
-    for name, tracer in (("people", "tagattention"), ("handheld", "tagattention_handheld")):
-        assert systems["tagattention"][name] == composed("train", f"tracer={tracer}")["tracer"]
+    assert systems["tagattention"] == composed("train")["tracer"]
 
 
 def test_frames_are_scored_alike_everywhere() -> None:
@@ -146,27 +136,17 @@ def test_frames_are_scored_alike_everywhere() -> None:
     assert from_mapping(ScoreSettings, scores[0]) == ScoreSettings()
 
 
-def test_every_story_has_tracer_settings_in_the_comparison() -> None:
-    systems = from_mapping(SystemSettings, composed("compare")["systems"])
-    for path in (CONF / "suite").glob("*.yaml"):
-        suite = from_mapping(Suite, suites_named([path.stem])[path.stem])
-        stories = {variant.story or suite.story for variant in suite.variants} - {PLANAR}
-        assert stories <= set(systems.settings_of), path.stem
-    with pytest.raises(ConfigError, match="settings_of: found magic"):
-        dataclasses.replace(systems, settings_of={"crowd": "magic"})
-
-
 @pytest.mark.parametrize(
     ("command", "override", "known"),
     [
         ("simulate", "suite=planar_trcks", "planar_tracks"),
         ("tagvision", "suite=planar_trcks", "planar_tracks"),
         ("evaluate", "suite=multi_5", "multi_4"),
-        ("evaluate", "tracer=tagvision", "tagattention_handheld"),
+        ("evaluate", "tracer=tagvision", "tagattention_published"),
         ("evaluate", "tracer@baselines.published=magic", "tagattention_published"),
         ("evaluate", "scores=as_traind", "as_trained"),
         ("train", "suite=multi_5", "multi_4"),
-        ("train", "experiment=handhold", "handheld"),
+        ("train", "experiment=contrast", "contrast_only"),
         ("train", "joint=pyramids", "pyramid"),
         ("train", "debug=on", "default"),
         ("train", "hparams_search=optun", "optuna"),

@@ -144,15 +144,20 @@ def test_unknown_settings_of_a_target_are_refused() -> None:
         make_tracer({"_target_": "tagjax.tagattention.TagAttention", "alhpa": 1.0})
 
 
-@pytest.mark.parametrize("tracer", ["tagattention.TagAttention", "tagattention.literal.TagAttentionLiteral"])
+LITERAL, LEARNABLE = "tagattention.literal.TagAttentionLiteral", "tagattention.TagAttention"
+
+
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("tracer", "settings", "message"),
     [
-        ({"cell": 0}, r"tracer: cell is 0; expected an integer of at least 1"),
-        ({"cell": 4.5}, r"tracer: "),  # beartype is first here
-        ({"beta": 2.0}, r"tracer: beta is 2\.0; expected a fraction from 0 to 1"),
-        ({"alpha_m2": -1.0}, r"tracer: alpha_m2 is -1\.0; expected a positive value"),
-        ({"alpha_m2": float("nan")}, r"tracer: alpha_m2 is nan; expected a positive value"),
+        (LITERAL, {"cell": 0}, r"tracer: cell is 0; expected an integer of at least 1"),
+        (LITERAL, {"cell": 4.5}, r"tracer: "),  # beartype is first here
+        (LITERAL, {"beta": 2.0}, r"tracer: beta is 2\.0; expected a fraction from 0 to 1"),
+        (LITERAL, {"alpha_m2": -1.0}, r"tracer: alpha_m2 is -1\.0; expected a positive value"),
+        (LITERAL, {"alpha_m2": float("nan")}, r"tracer: alpha_m2 is nan; expected a positive value"),
+        (LEARNABLE, {"dwell": {"memory_s": -1.0}}, r"tracer\.dwell: .*-1\.0; expected a positive"),
+        (LEARNABLE, {"dwell": {"memory_ms": 1.0}}, r"tracer\.dwell: .*memory_ms"),
+        (LEARNABLE, {"dwell": None}, r"tracer: dwell and attention are both off"),
     ],
 )
 def test_settings_that_no_tracer_can_have_are_named(tracer: str, settings: dict, message: str) -> None:
@@ -168,7 +173,7 @@ def _composed(command: str, *overrides: str) -> Any:
 @pytest.mark.parametrize(
     ("command", "overrides", "path", "schema", "changes"),
     [
-        ("train", [], "data", DataSettings, {"clips"}),
+        ("train", [], "data", DataSettings, {}),
         ("train", [], "objective", ObjectiveSettings, {}),
         ("train", [], "scores", ScoreSettings, {}),
         ("train", [], "loop", LoopSettings, {}),

@@ -27,12 +27,10 @@ from tagjax.metrics.recordings import ScoreSettings
 from tagjax.recording import Recording, RecordingError
 from tagjax.report.intervals import interval_bars
 from tagjax.sim.suites import Item, Suite
-from tagjax.tagattention import segmentation
 from tagjax.tagattention.published import TagAttentionPublished
 from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.tracing.clips import load_clip
 from tagjax.tracing.recordings import trace_recording
-from tagjax.tracing.tracer import MAX_OBJECTS
 
 ROOT = Path(__file__).parents[1]
 QUIET = ScoreSettings(min_pixels=2, num_pictures=0)
@@ -121,36 +119,6 @@ def test_true_reads_come_when_and_on_the_channel_that_the_recording_has() -> Non
     assert arrivals["rssi_dbm"][valid].min() == RSSI_DBM
 
 
-def test_a_given_object_is_one_segment_and_shares_with_no_other() -> None:
-    height, width, cell = 24, 32, 8
-    rng = np.random.default_rng(0)
-    points = jnp.asarray(rng.normal(size=(height, width, 3)), jnp.float32)
-    valid = jnp.ones((height, width), bool).at[5, 6].set(False)
-    objects = np.zeros((height, width), np.int32)
-    objects[4:20, 3:27], objects[0:3, 20:30] = 1, 3
-    given = segmentation.membership(jnp.asarray(objects), MAX_OBJECTS)
-    segments = segmentation.segment(points, valid, jnp.asarray(0.5), cell=cell, objects=given)
-    values = jnp.asarray(rng.normal(size=(height, width, 2)), jnp.float32)
-    mean, mass = segmentation.pool(segments, values, valid.astype(jnp.float32))
-    assert mass.shape == segments.weight.shape
-    back = np.asarray(segmentation.unpool(segments, mean))
-    for number in (1, 3):
-        inside = (objects == number) & np.asarray(valid)
-        expected = np.broadcast_to(np.asarray(values)[inside].mean(axis=0), back[inside].shape)
-        np.testing.assert_allclose(back[inside], expected, atol=1e-5)
-    # What an object holds is nowhere else: the others are grouped as if it were not there.
-    alone = segmentation.segment(points, valid & jnp.asarray(objects == 0), jnp.asarray(0.5), cell=cell)
-    plain, _ = segmentation.pool(alone, values, valid.astype(jnp.float32))
-    outside = objects == 0
-    np.testing.assert_allclose(back[outside], np.asarray(segmentation.unpool(alone, plain))[outside], atol=1e-5)
-    affinity = segmentation.segment_affinity(
-        segments, jnp.zeros((*mass.shape, 3)), jnp.zeros(mass.shape), jnp.asarray(1.0)
-    )
-    below = np.asarray(mass)[segments.num_cell_rows :] > 0
-    assert below.sum() == 2
-    np.testing.assert_allclose(np.asarray(affinity[4, segments.num_cell_rows :])[below], 1.0, atol=1e-6)
-
-
 def test_objects_are_the_labels_at_the_working_resolution(small_walkers: Recording) -> None:
     clip = load_clip(small_walkers, 2, 6, stride=2, flow="truth", estimator="truth")
     given = with_objects(clip, small_walkers, 2)
@@ -197,7 +165,7 @@ def _masks(traces, truth_labels: np.ndarray, labels: dict[str, int], epcs: list[
 
 @pytest.mark.parametrize(
     "name",
-    ["tagattention", "tagattention_published", pytest.param("tagattention_segments", marks=pytest.mark.ci)],
+    [pytest.param("tagattention", marks=pytest.mark.ci), "tagattention_published"],
 )
 def test_every_swap_applies_and_the_best_cut_is_better(small_walkers: Recording, name: str) -> None:
     settings = {**composed("error_budget", f"tracer@tracers.learnable={name}")["tracers"]["learnable"]}

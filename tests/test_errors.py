@@ -39,7 +39,7 @@ def test_the_command_ends_with_the_known_choices(tmp_path: Path) -> None:
     done = subprocess.run(run, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 1
     assert "Could not find 'tracer/tagvision'" in done.stderr
-    assert "tagattention_handheld" in done.stderr
+    assert "tagattention_published" in done.stderr
 
 
 def test_a_command_ends_with_one_line(tmp_path: Path) -> None:

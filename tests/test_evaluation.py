@@ -23,7 +23,6 @@ from tagjax.metrics.recordings import ScoreSettings, box_to_picture, evaluate_re
 from tagjax.recording import RecordingError
 from tagjax.report.overlay import MIN_WIDTH, _extent, _free_place, draw_overlay
 from tagjax.report.report import score_table, summarise, write_frames, write_report
-from tagjax.tagattention import TagAttention
 from tagjax.tagattention.frame_trace import describe
 from tagjax.tracing.clips import ClipSettings, clip_loader
 from tagjax.tracing.recordings import _tags, trace_recording
@@ -222,7 +221,7 @@ def test_what_is_thin_at_its_ends_is_boxed_whole() -> None:
 def _box_of_the_true_mask(labels: np.ndarray, stride: int) -> np.ndarray:
     mask = jnp.asarray(labels[::stride, ::stride] == 1, jnp.float32)[None]
     none = jnp.zeros((1, *mask.shape[1:]))
-    found = describe(mask, jnp.zeros((1, 3)), none, none[0] > 0, jnp.ones(1), TagAttention().box_tail)
+    found = describe(mask, jnp.zeros((1, 3)), none, none[0] > 0, jnp.ones(1), 0.0)
     return box_to_picture(np.asarray(found.box_px[0]), stride, *labels.shape)
 
 

@@ -28,14 +28,14 @@ from tagjax.training.checkpoint import CheckpointError, Checkpoints
 from tagjax.training.loop import resume_state
 from tagjax.training.state import TrainState
 
-SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "whole": None}
 NESTED = "[" * 100_000
 
 
 @pytest.fixture
 def parameters(tmp_path: Path) -> Path:
     path = tmp_path / "weights.json"
-    save_parameters(path, TagAttention(cell=4), SETTINGS, {"stride": 2})
+    save_parameters(path, TagAttention(whole=None), SETTINGS, {"stride": 2})
     return path
 
 
@@ -77,7 +77,7 @@ def test_parameters_that_are_not_finite_in_float32_are_refused(parameters: Path,
     del content["sha256"]
     parameters.write_text(json.dumps({**content, "sha256": json_checksum(content)}))  # a hostile file has a checksum
     with pytest.raises(ValueError, match=rf"weights\.json: parameters\.{name}: not finite in float32") as error:
-        load_parameters(TagAttention(cell=4), parameters, SETTINGS)
+        load_parameters(TagAttention(whole=None), parameters, SETTINGS)
     _one_line(error)
 
 

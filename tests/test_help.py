@@ -69,7 +69,7 @@ def test_every_choice_that_is_listed_can_be_chosen(name: str) -> None:
 
 
 def test_comments_come_from_the_files_of_the_groups() -> None:
-    text = _help("train", "experiment=handheld", "joint=pyramid")
+    text = _help("train", "experiment=contrast_only", "joint=pyramid")
     assert re.search(r"^  lock_s: 0\.33  # the time for which", text, re.MULTILINE)
     assert re.search(r"^  flow@joint\.flow=pyramid  \(flownet_c, .*, raft_small\)$", text, re.MULTILINE)
     assert re.search(r"^    min_motion: 0\.1  # a clip is drawn if", text, re.MULTILINE)

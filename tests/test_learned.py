@@ -22,7 +22,7 @@ from tagjax.tagattention.tracer_settings import learned_tracer, make_tracer, set
 from tagjax.tracing.clips import ClipSettings
 
 CONF = str((Path(__file__).parents[1] / "conf").resolve())
-SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+SETTINGS: dict[str, Any] = {"_target_": "tagjax.tagattention.TagAttention", "whole": None}
 CLIPS: dict[str, Any] = {
     "stride": 2,
     "window": 3,
@@ -33,10 +33,10 @@ CLIPS: dict[str, Any] = {
 }
 
 
-def _stirred(seed: int = 0) -> TagAttention:
+def _stirred(seed: int = 0, tracer: TagAttention | None = None) -> TagAttention:
     rng = np.random.default_rng(seed)
     stir = lambda leaf: leaf + jnp.asarray(rng.normal() * 0.2, leaf.dtype) if eqx.is_inexact_array(leaf) else leaf  # noqa: E731
-    return jax.tree.map(stir, TagAttention(cell=4))
+    return jax.tree.map(stir, TagAttention(whole=None) if tracer is None else tracer)
 
 
 def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
@@ -46,35 +46,34 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert isinstance(back, TagAttention)
     assert jax.tree.structure(back) == jax.tree.structure(stirred)
     assert back.physical() == pytest.approx(stirred.physical(), rel=1e-5)
-    fresh = TagAttention(cell=4)
+    fresh = TagAttention(whole=None)
     assert any(float(a) != float(b) for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(fresh), strict=True))
 
 
 def test_default_is_what_was_learned_from_these_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learned, "PACKAGED", tmp_path)
     save_parameters(tmp_path / "one.json", _stirred(1), SETTINGS, CLIPS)
-    save_parameters(tmp_path / "two.json", _stirred(2), {**SETTINGS, "beta": 0.5}, CLIPS)
+    save_parameters(tmp_path / "two.json", _stirred(2), {**SETTINGS, "dwell": {"memory_s": 2.0}}, CLIPS)
     assert packaged_parameters() == ("one", "two")
-    tracer = TagAttention(cell=4)
-    for name, settings in (("one", SETTINGS), ("two", {**SETTINGS, "beta": 0.5})):
+    tracer = TagAttention(whole=None)
+    for name, settings in (("one", SETTINGS), ("two", {**SETTINGS, "dwell": {"memory_s": 2.0}})):
         chosen, named = (load_parameters(tracer, source, settings) for source in ("default", name))
         assert chosen.physical() == named.physical()
     with pytest.raises(ValueError, match=r"no packaged parameters were learned from these settings.*one, two"):
-        load_parameters(tracer, "default", {**SETTINGS, "cell": 9})
+        load_parameters(tracer, "default", {**SETTINGS, "detection": {"threshold": 0.4}})
 
 
 def test_settings_that_learned_parameters_replace_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "one.json"
     save_parameters(path, _stirred(1), SETTINGS, CLIPS)
-    tracer = TagAttention(cell=4)
-    with pytest.raises(ValueError, match=r"found tracer\.beta=0\.5; expected 0\.8"):
-        load_parameters(tracer, path, {**SETTINGS, "beta": 0.5})
-    other = {**SETTINGS, "cell": 9, "max_speed_m_s": 2.0}  # which are not learned
+    tracer = TagAttention(whole=None)
+    with pytest.raises(ValueError, match=r"found tracer\.dwell\.memory_s=2\.0; expected 4\.0"):
+        load_parameters(tracer, path, {**SETTINGS, "dwell": {"memory_s": 2.0}})
+    other = {**SETTINGS, "detection": {"threshold": 0.4}, "hidden": None}  # which are not learned
     with pytest.raises(
-        ValueError, match=r"found tracer\.cell=9, .*; expected tracer\.cell=4, .*Set the expected values"
+        ValueError, match=r"found tracer\.hidden=null, .*; expected tracer\.hidden=not null, .*Set the expected values"
     ):
         load_parameters(tracer, path, other)
-    load_parameters(tracer, _changed(path, version=3), other)  # whose files held none of them
 
 
 def _changed(path: Path, **changes: Any) -> Path:
@@ -86,26 +85,18 @@ def _changed(path: Path, **changes: Any) -> Path:
     return other
 
 
-@pytest.mark.parametrize("weights", ["default", "tagattention"])
-def test_what_did_not_move_in_learning_may_be_asked_for(weights: str) -> None:
-    """`tracer.rest_doubt=0.2` with packaged parameters, as docs/learning.md advises."""
-    with initialize_config_dir(CONF, version_base="1.3"):
-        plain, doubting = (
-            OmegaConf.to_container(compose("train", ["tracer=tagattention", *more]).tracer, resolve=True)
-            for more in ([], ["tracer.rest_doubt=0.2"])
-        )
-    without, with_doubt = (make_tracer(one, weights) for one in (plain, doubting))
-    assert isinstance(without, TagAttention)
-    assert isinstance(with_doubt, TagAttention)
-    result = with_doubt.physical()
-    assert result.pop("rest_doubt") == pytest.approx(0.2)
-    assert result == {name: value for name, value in without.physical().items() if name != "rest_doubt"}
-    with pytest.raises(ValueError, match=r"things_in_hand\.json: found tracer\.rest_doubt=0\.2; expected 0\.0"):
-        make_tracer(doubting, "things_in_hand")  # which learned it
+def test_what_did_not_move_in_learning_may_be_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "one.json"
+    tracer = TagAttention(whole=None)
+    learned_ones = {**tracer.physical(), "dwell.memory_s": 3.0}
+    save_parameters(path, tracer.with_physical(learned_ones), SETTINGS, CLIPS)
+    asked = make_tracer({**SETTINGS, "hidden": {"margin_nats": 5.0}}, str(path))
+    assert isinstance(asked, TagAttention)
+    assert asked.physical() == pytest.approx({**learned_ones, "hidden.margin_nats": 5.0}, rel=1e-5)
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    tracer = TagAttention(cell=4)
+    tracer = TagAttention(whole=None)
     path = tmp_path / "weights.json"
     save_parameters(path, tracer, SETTINGS, CLIPS)
     good = tracer.physical()
@@ -115,18 +106,19 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(ValueError, match="no learned parameters"):
         load(format="another")
-    with pytest.raises(ValueError, match="version 7; this release reads 3"):
+    with pytest.raises(ValueError, match="version 7; this release reads 4"):
         load(version=7)
-    with pytest.raises(ValueError, match="beta: not a number"):
-        load(parameters={**good, "beta": None})
-    with pytest.raises(ValueError, match=r"parameters\.alpha: not finite in float32"):
-        load(parameters={**good, "alpha": float("nan")})
-    with pytest.raises(ValueError, match=r"missing \['beta'\], unknown \['gamma'\]"):
-        load(parameters={**{name: value for name, value in good.items() if name != "beta"}, "gamma": 1.0})
-    with pytest.raises(ValueError, match=r"beta is 1\.5; expected a fraction from 0 to 1"):
-        load(parameters={**good, "beta": 1.5})
-    with pytest.raises(ValueError, match="positive value"):
-        load(parameters={**good, "alpha": -1.0})
+    with pytest.raises(ValueError, match=r"dwell\.memory_s: not a number"):
+        load(parameters={**good, "dwell.memory_s": None})
+    with pytest.raises(ValueError, match=r"parameters\.dwell\.memory_s: not finite in float32"):
+        load(parameters={**good, "dwell.memory_s": float("nan")})
+    less = {name: value for name, value in good.items() if name != "dwell.memory_s"}
+    with pytest.raises(ValueError, match=r"dwell\.memory_s.*dwell\.gamma|dwell\.gamma.*dwell\.memory_s"):
+        load(parameters={**less, "dwell.gamma": 1.0})
+    with pytest.raises(ValueError, match=r"reader\.outlier: value is 1\.5; expected a fraction"):
+        load(parameters={**good, "reader.outlier": 1.5})
+    with pytest.raises(ValueError, match=r"dwell\.memory_s: value is -1\.0; expected a positive"):
+        load(parameters={**good, "dwell.memory_s": -1.0})
     path.write_text(path.read_text()[:40])
     with pytest.raises(ValueError, match="no learned parameters"):
         load_parameters(tracer, path, SETTINGS)
@@ -139,21 +131,6 @@ def test_a_tracer_without_learned_parameters_is_refused() -> None:
         make_tracer({"_target_": "tagjax.tagattention.literal.TagAttentionLiteral"}, "default")
 
 
-def test_packaged_parameters_are_of_the_tracer_as_it_is_configured() -> None:
-    with initialize_config_dir(CONF, version_base="1.3"):
-        composed = OmegaConf.to_container(compose("train", ["tracer=tagattention"]), resolve=True)
-    assert isinstance(composed, dict)
-    assert packaged_parameters() == ("tagattention", "things_in_hand")
-    untrained, default, people, things = (
-        make_tracer(composed["tracer"], weights) for weights in (None, "default", *packaged_parameters())
-    )
-    assert all(isinstance(one, TagAttention) for one in (untrained, default, people, things))
-    found = [one.physical() for one in (untrained, default, things) if isinstance(one, TagAttention)]
-    assert found[0] != found[1] != found[2] != found[0]
-    assert isinstance(people, TagAttention)
-    assert people.physical() == found[1]
-
-
 def _tracer_settings(name: str) -> dict[str, Any]:
     with initialize_config_dir(CONF, version_base="1.3"):
         composed = OmegaConf.to_container(compose("train", [f"tracer={name}"]).tracer, resolve=True)
@@ -161,19 +138,25 @@ def _tracer_settings(name: str) -> dict[str, Any]:
     return {str(key): value for key, value in composed.items()}
 
 
-@pytest.mark.parametrize("weights", ["default", "tagattention", "things_in_hand"])
-def test_packaged_parameters_need_no_further_setting(weights: str) -> None:
-    """They bring their tracer and the clips that it was trained with: every second pixel."""
-    tracer, clips = learned_tracer(weights)
-    settings = _tracer_settings("tagattention")
-    named, same_clips = learned_tracer(weights, settings)
-    assert isinstance(tracer, TagAttention)
-    assert isinstance(named, TagAttention)
-    made = make_tracer(settings, weights)
-    assert isinstance(made, TagAttention)
-    assert tracer.physical() == named.physical() == made.physical()
-    assert clips == same_clips == ClipSettings(stride=2)
+def test_packaged_parameters_need_no_further_setting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They bring their tracer and the clips that it was trained with."""
+    monkeypatch.setattr(learned, "PACKAGED", tmp_path)
+    settings = {name: value for name, value in _tracer_settings("tagattention").items() if name != "clips"}
+    save_parameters(tmp_path / "one.json", _stirred(tracer=TagAttention()), settings, CLIPS)
+    for weights in ("default", "one"):
+        tracer, clips = learned_tracer(weights)
+        named, same_clips = learned_tracer(weights, settings)
+        made = make_tracer(settings, weights)
+        assert all(isinstance(one, TagAttention) for one in (tracer, named, made))
+        assert tracer.physical() == named.physical() == made.physical()
+        assert clips == same_clips == ClipSettings(stride=2, window=3)
     assert ClipSettings().stride is None  # without weights: as the camera has it
+
+
+def test_there_are_no_packaged_parameters_yet() -> None:
+    assert packaged_parameters() == ()
+    with pytest.raises(ValueError, match=r"weights=default: no packaged parameters .* \(packaged are: none\)"):
+        learned_tracer("default")
 
 
 def test_clip_settings_come_back_without_the_sizes_of_buffers(tmp_path: Path) -> None:
@@ -207,9 +190,11 @@ def test_a_flow_beside_the_weights_moves_with_them(tmp_path: Path) -> None:
 
 
 def test_a_tracer_configuration_brings_its_clips() -> None:
-    settings = _tracer_settings("tagattention_handheld")
+    settings = _tracer_settings("tagattention")
     assert tracer_clips(settings) == ClipSettings()
-    assert tracer_clips(_tracer_settings("tagattention")) == ClipSettings(stride=4)
+    assert tracer_clips(_tracer_settings("tagattention_published")) == ClipSettings(
+        window_s=0.133, estimator="published"
+    )
     assert isinstance(make_tracer(settings), TagAttention)
     with pytest.raises(ConfigError, match=r"tracer\.clips: unknown key 'strid'"):
         tracer_clips({**settings, "clips": {"strid": 2}})

@@ -115,9 +115,9 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
         return TrainingResult(eqx.tree_at(lambda one: one.model, state, learned))
 
     values = _values(recordings)
-    values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+    values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "whole": None}
     values["data"]["validation"] = []
-    learned = make_tracer({**values["tracer"], "alpha_m2": 0.001})
+    learned = make_tracer({**values["tracer"], "dwell": {"memory_s": 3.0}})
     monkeypatch.setattr(run_module, "train", moved)
     assert math.isnan(run_training(from_mapping(TrainConfig, values), tmp_path))
     kept = make_tracer(values["tracer"], str(tmp_path / "weights.json"))
@@ -166,7 +166,7 @@ def test_a_run_may_be_scored_smoothed(recordings: list[str], tmp_path: Path) -> 
     values = _values(recordings)
     values["scores"]["smooth"] = True
     values["baselines"] = {"paper": values["tracer"]}
-    values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+    values["tracer"] = {"_target_": "tagjax.tagattention.TagAttention", "whole": None}
     values["loop"]["num_steps"] = 1
     score = run_training(from_mapping(TrainConfig, values), tmp_path)
     summary = json.loads((tmp_path / "metrics.json").read_text())
@@ -219,7 +219,7 @@ def test_command_lines(recordings: list[str], tmp_path: Path) -> None:
             f"data.recordings=[{recordings[0]}]",
             f"data.validation=[{recordings[1]}]",
             "data.clips.stride=4",
-            "tracer.cell=4",
+            "tracer.segments.segmenter.num_segments=512",
             f"hydra.run.dir={run}",
         ],
         cwd=ROOT,

@@ -323,12 +323,12 @@ def test_every_measure_is_one_that_scores_have():
 
 
 def test_columns_of_a_row_may_be_of_other_systems():
-    systems = {"a": {"tracer": "tagattention_literal"}, "b": {"tracer": "tagattention_handheld"}}
+    systems = {"a": {"tracer": "tagattention_literal"}, "b": {"tracer": "tagattention"}}
     row = {"label": "a", "suite": "small", "protocol": "part", "system": {"iou": "a", "all": "b"}}
     recipe = _recipe(rows=[row], systems=systems)
     assert [job.system for job in recipe.jobs()] == ["a", "b"]
     assert recipe.job(recipe.rows[0], "locked") is None
-    assert recipe.tracers() == ["tagattention_literal", "tagattention_handheld"]
+    assert recipe.tracers() == ["tagattention_literal", "tagattention"]
 
 
 @pytest.mark.parametrize(
@@ -563,10 +563,9 @@ def test_tables_that_need_the_same_scores_share_them():
         _follows_from(from_mapping(Recipe, _settings(ROOT / "conf" / "table" / f"{name}.yaml")))
         for name in ("main", "suites")
     )
-    for suite in ("single_static", "multi_4"):
-        for one, other in (("handheld_online", "handheld"), ("handheld_published", "published")):
-            assert main[f"{suite}/test/whole/{one}"] == suites[f"{suite}/test/whole/{other}"]
-    assert main["walkers/test/whole/people_online"] == suites["walkers/test/whole/people"]
+    for suite in ("single_static", "multi_4", "walkers"):
+        for system in ("online", "published"):
+            assert main[f"{suite}/test/whole/{system}"] == suites[f"{suite}/test/whole/{system}"]
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)

@@ -23,7 +23,7 @@ from tagjax.tracing.live import LiveTracer
 from tagjax.tracing.status import Status
 from tagjax.tracing.tracer import trace
 
-CONF = Path(__file__).parents[1] / "conf/tracer/tagattention_segments.yaml"
+CONF = Path(__file__).parents[1] / "conf/tracer/tagattention.yaml"
 TRACER = TagAttention(segments=SegmentTracker(segmenter=Segmenter(num_segments=512)))
 
 

@@ -10,18 +10,9 @@ from tagjax.tagattention import segmentation
 
 # Compiled as a whole: as single operations most of the time would go into compiling each.
 segment = jax.jit(segmentation.segment, static_argnames=("cell", "num_iterations"))
-mean_shift = jax.jit(segmentation.mean_shift, static_argnames="num_iterations")
 bounding_box = jax.jit(segmentation.bounding_box, static_argnames="tail")
-cdf_corner, diffuse, min_max, pool, segment_affinity, unpool = map(
-    jax.jit,
-    (
-        segmentation.cdf_corner,
-        segmentation.diffuse,
-        segmentation.min_max,
-        segmentation.pool,
-        segmentation.segment_affinity,
-        segmentation.unpool,
-    ),
+cdf_corner, min_max, pool, unpool = map(
+    jax.jit, (segmentation.cdf_corner, segmentation.min_max, segmentation.pool, segmentation.unpool)
 )
 
 
@@ -115,27 +106,6 @@ def test_temperature_gradient_agrees_with_finite_differences(gradients_agree):
     np.testing.assert_allclose(exact, numeric, rtol=2e-2)
 
 
-def test_diffusion_keeps_constants_and_rests_at_rate_0():
-    points = _two_planes(edge=16)
-    segments = segment(points, jnp.ones((24, 32), dtype=bool), jnp.asarray(0.05), cell=8)
-    centre, _ = pool(segments, points, jnp.ones((24, 32)))
-    shape = segments.weight.shape
-    affinity = segment_affinity(segments, centre, jnp.zeros(shape), jnp.asarray(0.3))
-    np.testing.assert_allclose(jnp.sum(affinity, axis=0), 1.0, rtol=1e-4)
-    np.testing.assert_allclose(diffuse(jnp.full(shape, 2.0), affinity, jnp.asarray(0.7)), 2.0, rtol=1e-4)
-    values = jnp.asarray(np.random.default_rng(0).normal(size=shape).astype(np.float32))
-    np.testing.assert_array_equal(diffuse(values, affinity, jnp.asarray(0.0)), values)
-
-
-def test_affinity_is_cut_where_depth_jumps():
-    points = _two_planes(24, 32, 16)
-    segments = segment(points, jnp.ones((24, 32), dtype=bool), jnp.asarray(1e-2), cell=8)
-    centre, _ = pool(segments, points, jnp.ones((24, 32)))
-    affinity = segment_affinity(segments, centre, jnp.zeros(segments.weight.shape), jnp.asarray(0.1))
-    # From the last near column to the first far one: right-hand neighbour, index 5.
-    assert float(affinity[5, :, 1].max()) < 1e-6
-
-
 def test_min_max_spans_0_to_1_over_valid_pixels():
     value = jnp.asarray([[1.0, 3.0], [5.0, 100.0]])
     valid = jnp.asarray([[True, True], [True, False]])
@@ -164,16 +134,6 @@ def test_corner_moves_smoothly_and_defaults_to_one_half():
     assert bool(jnp.isfinite(gradient).all())
     assert float(jnp.abs(gradient).max()) > 0
     np.testing.assert_allclose(cdf_corner(probability, valid, jnp.asarray(0.9), jnp.asarray(1e-4)), 0.5, atol=1e-4)
-
-
-def test_mean_shift_finds_the_near_mode():
-    rng = np.random.default_rng(0)
-    cloud = np.concatenate([rng.normal([0, 0, 2], 0.05, (200, 3)), rng.normal([2, 0, 3], 0.05, (400, 3))])
-    points = jnp.asarray(cloud.astype(np.float32).reshape(20, 30, 3))
-    out = mean_shift(points, jnp.ones((20, 30)), jnp.asarray([0.2, 0.1, 2.1]), jnp.asarray(0.3), num_iterations=10)
-    np.testing.assert_allclose(out, cloud[:200].mean(axis=0), atol=0.01)
-    far = jnp.asarray([50.0, 0.0, 0.0])
-    np.testing.assert_array_equal(mean_shift(points, jnp.ones((20, 30)), far, jnp.asarray(0.3)), far)
 
 
 def test_box_of_a_binary_mask_is_exact_and_a_tail_drops_strays():

@@ -28,11 +28,11 @@ from tagjax.tagattention.segments import CarryingBody, Detection, RigidMotion, S
 from tagjax.tagattention.tracer_settings import learned_tracer, make_tracer
 from tagjax.tracing.tracer import trace
 from tagjax.training.config import TrainConfig
-from tagjax.training.objective import ObjectiveSettings, objective_inputs
+from tagjax.training.objective import TERM_NAMES, ObjectiveSettings, objective_inputs
 from tagjax.training.run import run_training
 from tagjax.training.step import _clip_gradient, clip_gradient, clip_loss
 
-CONF = yaml.safe_load((Path(__file__).parents[1] / "conf/tracer/tagattention_segments.yaml").read_text())
+CONF = yaml.safe_load((Path(__file__).parents[1] / "conf/tracer/tagattention.yaml").read_text())
 KEY = jax.random.PRNGKey(0)
 OBJECTIVE = ObjectiveSettings(
     memory=1.0, span_frames=6, skip_frames=6, max_reads=128, num_channels=4, future_stride=1, calibration=0.0
@@ -118,17 +118,19 @@ def test_parameters_have_the_gradients_of_central_differences(clip) -> None:
     with jax.enable_x64(True):
         tracer = _in_double(_tracer(rigid=RigidMotion(most=1.9, least=3.7)))
         camera, frames = _in_double(clip.camera), _in_double(clip.frames)
-        gradient, logged = clip_gradient(tracer, camera, frames, KEY, OBJECTIVE)
+        every_term = dataclasses.replace(OBJECTIVE, area=0.5, compactness=0.5, steadiness=0.5, calibration=0.2)
+        assert set(every_term.weights()) == set(TERM_NAMES)
+        gradient, logged = clip_gradient(tracer, camera, frames, KEY, every_term)
         assert np.isfinite(float(logged["loss"]))
         for name, seen in (
             *((name, True) for name in ("reader.spread_rad", "body.rigid.noise_m", "body.rigid.most")),
             *((name, True) for name in ("body.neighbour_m", "body.prior", "dwell.memory_s")),
-            ("detection.elsewhere", False),
+            ("detection.elsewhere", True),
         ):
             of = operator.attrgetter(name)
             leaf = lambda m, of=of: getattr(of(m), "unconstrained", of(m))  # noqa: E731
             ends = [eqx.tree_at(leaf, tracer, leaf(tracer) + step) for step in (1e-6, -1e-6)]
-            high, low = (float(clip_loss(one, camera, frames, KEY, OBJECTIVE)["loss"]) for one in ends)
+            high, low = (float(clip_loss(one, camera, frames, KEY, every_term)["loss"]) for one in ends)
             assert float(leaf(gradient)) == pytest.approx((high - low) / 2e-6, rel=1e-3, abs=1e-8), name
             assert (abs(high - low) > 1e-11) == seen, name
 

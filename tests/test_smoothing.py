@@ -6,9 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
@@ -19,12 +16,9 @@ from tagjax.metrics.recordings import ScoreSettings
 from tagjax.recording import Recording, RecordingError
 from tagjax.recording.store import open_recording
 from tagjax.recording.time_reversal import time_reversed
-from tagjax.tagattention import TagAttention
-from tagjax.tagattention.backward_message import BackwardMessage
 from tagjax.tagattention.literal import TagAttentionLiteral
 from tagjax.tracing.clips import Clip, ClipSettings, load_clip
 from tagjax.tracing.recordings import trace_recording
-from tagjax.tracing.tracer import Camera, Frame, Trace, trace
 from tagjax.training.evaluate import evaluate_tracers
 
 EPCS = list(synthetic.EPCS)
@@ -34,26 +28,6 @@ NUM_FRAMES = 20
 @pytest.fixture(scope="module")
 def recording() -> Recording:
     return synthetic.recording(NUM_FRAMES)
-
-
-def _tracer(**changed) -> TagAttention:
-    return TagAttention(**{"cell": 4, "alpha_m2": 1e-3, "prior_weight": 3.0, **changed})
-
-
-@eqx.filter_jit
-def _back(tracer: TagAttention, camera: Camera, frames: Frame) -> BackwardMessage:
-    """What later frames say of each, in the order of time; `frames` go backwards."""
-    first = jax.tree.map(lambda leaf: leaf[0], frames)
-    step = lambda state, frame: tracer.backward_step(camera, state, frame)  # noqa: E731
-    _, found = jax.lax.scan(step, tracer.init(camera, first), frames)
-    return jax.tree.map(lambda leaf: leaf[::-1], found)
-
-
-def _outlines(mask: np.ndarray, box: tuple[int, int, int, int]) -> float:
-    x0, y0, x1, y1 = box
-    inside = np.zeros(mask.shape, bool)
-    inside[y0 : y1 + 1, x0 : x1 + 1] = True
-    return float(((mask > 0.5) & inside).sum() / ((mask > 0.5) | inside).sum())
 
 
 def test_twice_backwards_is_forwards(recording: Recording) -> None:
@@ -133,82 +107,8 @@ def test_reversed_reads_give_reversed_distances(recording: Recording) -> None:
         )
 
 
-@pytest.mark.ci
-def test_past_and_future_add_up_to_all_there_is(recording: Recording) -> None:
-    """Where nothing fades or is bounded and motion is seen pair by pair, their sum is the same at every frame."""
-    tracer = _tracer(
-        memory_s=1e9, evidence_limit=1e6, phase_weight=1e-12, coherent_weight=1e-12, anchor_rate=1e-12, v0_m_s=1e-6
-    )  # fmt: skip
-    settings = {"stride": 1, "flow": "zero", "epcs": EPCS, "estimator": "truth", "window": 2}
-    ways = [load_clip(one, 0, NUM_FRAMES, **settings) for one in (recording, time_reversed(recording))]
-    forwards = eqx.filter_jit(
-        lambda frames: jax.lax.scan(
-            lambda state, frame: (after := tracer.step(ways[0].camera, state, frame)[0], after.log_odds),
-            tracer.init(ways[0].camera, jax.tree.map(lambda leaf: leaf[0], frames)),
-            frames,
-        )[1]
-    )(ways[0].frames)
-    later = _back(tracer, ways[1].camera, ways[1].frames).log_odds
-    total = np.asarray(forwards + later)
-    scale = np.abs(total).max()
-    assert scale > 5.0
-    np.testing.assert_allclose(total, np.broadcast_to(total[-1:], total.shape), atol=2e-4 * scale)
-    np.testing.assert_allclose(total[-1], forwards[-1], atol=2e-4 * scale)
-
-
 def _load(one: Recording, start: int, stop: int, *, epcs: Sequence[str]) -> Clip:
     return load_clip(one, start, stop, stride=1, flow="zero", epcs=epcs)
-
-
-@pytest.mark.ci
-def test_the_first_frame_uses_the_later_ones(recording: Recording) -> None:
-    """Whoever only looks forwards knows nothing yet."""
-    settings = ScoreSettings(frames_at_once=7)
-
-    def traced(smooth: bool, first: int, last: int) -> list[tuple[int, Trace]]:
-        chosen = dataclasses.replace(settings, smooth=smooth)
-        return list(trace_recording(_tracer(), recording, _load, epcs=EPCS, settings=chosen, frames=(first, last)))
-
-    ((_, filtered),) = traced(False, 0, 1)
-    for first, last in ((0, NUM_FRAMES), (2, 15)):
-        smoothed = traced(True, first, last)
-        assert [number for number, _ in smoothed] == list(range(first, last))
-        for tag, box in enumerate(synthetic.BOXES.values()):
-            assert _outlines(smoothed[0][1].mask[tag], box) > 0.6
-            assert smoothed[0][1].detected[tag]
-            assert np.mean([_outlines(out.mask[tag], box) for _, out in smoothed]) > 0.6
-    for tag, box in enumerate(synthetic.BOXES.values()):
-        assert _outlines(filtered.mask[tag], box) < 0.3
-        assert not filtered.detected[tag]
-
-
-@pytest.mark.ci
-def test_pieces_and_groups_give_what_two_scans_give(recording: Recording) -> None:
-    tracer = _tracer(rivalry=1e-12)  # so that tags can be traced one at a time
-    settings = ScoreSettings(frames_at_once=7, tags_at_once=1, smooth=True)
-    pieces = list(trace_recording(tracer, recording, _load, epcs=EPCS, settings=settings))
-    clip, turned = (_load(one, 0, NUM_FRAMES, epcs=EPCS) for one in (recording, time_reversed(recording)))
-    later = _back(tracer, turned.camera, turned.frames)
-    whole = eqx.filter_jit(trace)(tracer, clip.camera, dataclasses.replace(clip.frames, backward_message=later))
-    for number, out in pieces:
-        np.testing.assert_allclose(out.mask, whole.mask[number], atol=0.02)  # half precision in between
-        np.testing.assert_allclose(out.confidence, whole.confidence[number], atol=0.01)
-
-
-@pytest.mark.ci
-def test_gradients_through_hindsight_are_finite(recording: Recording) -> None:
-    clip = load_clip(recording, 0, 6, stride=1, flow="zero", epcs=EPCS)
-    turned = load_clip(time_reversed(recording), NUM_FRAMES - 6, NUM_FRAMES, stride=1, flow="zero", epcs=EPCS)
-
-    @eqx.filter_jit
-    @eqx.filter_grad
-    def gradient(tracer):
-        later = _back(tracer, turned.camera, turned.frames)
-        return jnp.mean(trace(tracer, clip.camera, dataclasses.replace(clip.frames, backward_message=later)).mask)
-
-    leaves = [leaf for leaf in jax.tree.leaves(gradient(_tracer())) if leaf is not None]
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
-    assert any(float(jnp.abs(leaf).max()) > 0 for leaf in leaves)
 
 
 def test_a_forward_only_tracer_is_refused_for_smoothing(tmp_path: Path) -> None:

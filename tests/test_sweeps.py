@@ -19,11 +19,12 @@ import cv2
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
+import yaml
 
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.sweep import Line, SweepConfig, point_name, read_lines, run_sweep, table, write_sweep
 from tagjax.tagattention import TagAttention
-from tagjax.tagattention.tracer_settings import make_tracer
+from tagjax.tagattention.tracer_settings import make_tracer, with_values
 from tagjax.training.logging import Logger, LoggerSettings
 
 ROOT = Path(__file__).parents[1]
@@ -249,6 +250,7 @@ SUITE = {
     "counts": {"train": 0, "validation": 0, "test": 1},
     "variants": [{"name": "slow", "settings": {"speed_m_s": 0.5}}, {"name": "fast", "settings": {"speed_m_s": 2.5}}],
 }
+LEARNABLE = yaml.safe_load((Path(__file__).parents[1] / "conf/tracer/tagattention.yaml").read_text())
 PAPER = {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "cell": 4, "v0_m_s": 0.1, "alpha_m2": 5e-4}
 
 
@@ -314,20 +316,34 @@ def test_a_table_weighs_frames_within_and_conditions_alike(tmp_path: Path) -> No
 
 def test_whole_numbers_and_words_of_a_grid_stay_what_they_are(tmp_path: Path) -> None:
     values = {"suites": {"tiny": SUITE}, "recordings_dir": str(tmp_path)}
-    tracer = {"_target_": "tagjax.tagattention.TagAttention", "cell": 6, "cut_rule": "margin", "v0_m_s": 0.1}
-    tracer["doubled_angle"] = True
-    grid = {"cell": [4, 8], "cut_rule": ["margin", "cdf_corner"], "v0_m_s": [0.5], "doubled_angle": [False]}
+    tracer = {
+        "_target_": "tagjax.tagattention.TagAttention",
+        "segments": {"segmenter": {"num_segments": 512, "reach": 2.0}},
+        "reader": {"modulo_pi": True},
+        "detection": {"threshold": 0.5},
+    }
+    grid = {
+        "segments.segmenter.num_segments": [256, 512],
+        "segments.segmenter.reach": [1.5, 2.0],
+        "detection.threshold": [0.4],
+        "reader.modulo_pi": [False],
+    }
     config = from_mapping(SweepConfig, {**values, "tracer": tracer, "grid": grid})
     first = config.points()[0]
-    assert [type(value) for value in first.values()] == [int, str, float, bool]
-    assert point_name(first) == "cell=4, cut_rule=margin, v0_m_s=0.5, doubled_angle=False"
+    assert [type(value) for value in first.values()] == [int, float, float, bool]
+    assert point_name(first) == (
+        "segments.segmenter.num_segments=256, segments.segmenter.reach=1.5, detection.threshold=0.4, reader.modulo_pi=False"
+    )
     for point in config.points():
-        assert isinstance(make_tracer({**config.tracer, **point}), TagAttention)
+        made = make_tracer(with_values(config.tracer, point))
+        assert isinstance(made, TagAttention)
+        assert made.segments.segmenter.num_segments == point["segments.segmenter.num_segments"]
+    assert tracer["segments"]["segmenter"]["num_segments"] == 512
     lines = [_line(point, "slow", 0.1 * number, 10) for number, point in enumerate(config.points())]
     write_sweep(tmp_path, config, lines)
-    assert "| 8 | cdf_corner | 0.5 | False | 0.300 |" in (tmp_path / "table.md").read_text()
-    many = {"cell": (2, 3, 4, 5), "cut_rule": ("margin", "cdf_corner")}
-    config = _config(tmp_path, tracer=tracer, grid=many)
+    assert "| 512 | 1.5 | 0.4 | False | 0.200 |" in (tmp_path / "table.md").read_text()
+    words = {"cell": (2, 3, 4, 5), "refine": (True, False)}
+    config = _config(tmp_path, tracer={**PAPER, "refine": True}, grid=words)
     write_sweep(tmp_path, config, [_line(point, "slow", 0.1, 10) for point in config.points()])
     assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
     with pytest.raises(ConfigError, match="cell is 0; expected an integer"):
@@ -351,6 +367,10 @@ def test_lines_cut_short_are_taken_away(tmp_path: Path) -> None:
         ({"grid": {}}, "grid is empty"),
         ({"grid": {"v0_m_s": ()}}, "grid is empty"),
         ({"grid": {"gamma": (1.0,)}}, "found gamma; expected parameters of the tracer, some of alpha_m2, cell, v0_m_s"),
+        (
+            {"grid": {"dwell.memory": (1.0,)}, "tracer": LEARNABLE},
+            r"found dwell\.memory; expected parameters of the tracer, some of .*dwell\.memory_s, .* \(conf/tracer has all\)",
+        ),
         ({"splits": ("exam",)}, "splits: found exam; expected some of train"),
     ],
 )

@@ -7,6 +7,7 @@ recording at every point is a line of a file, so that an interrupted sweep can b
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import hashlib
 import itertools
 import json
@@ -25,9 +26,10 @@ from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_record
 from ..recording.store import open_recording
 from ..report.sweep import curve_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
-from ..tagattention.tracer_settings import make_tracer, settled, tracer_clips
+from ..tagattention.tracer_settings import make_tracer, setting_names, settled, tracer_clips, with_values
 from ..tracing.clips import ClipSettings, clip_loader
 
+_MAX_NAMES = 12  # of parameters in an error
 _MAX_CURVES = 6
 """Up to this many points are plotted as one curve each; more are plotted by parameter."""
 
@@ -62,9 +64,13 @@ class SweepConfig:
             raise ConfigError(
                 "grid is empty; expected values of the tracer's parameters, for example 'grid={v0_m_s:[0.01,0.1,0.5]}'."
             )
-        if unknown := sorted(set(self.grid) - set(self.tracer)):
-            known = ", ".join(sorted(set(self.tracer) - {"_target_", "clips"}))
-            raise ConfigError(f"grid: found {', '.join(unknown)}; expected parameters of the tracer, some of {known}.")
+        known = setting_names(self.tracer)
+        if unknown := sorted(set(self.grid) - set(known)):
+            near = sorted(known if len(known) <= _MAX_NAMES else difflib.get_close_matches(unknown[0], known, 5, 0.0))
+            raise ConfigError(
+                f"grid: found {', '.join(unknown)}; expected parameters of the tracer, some of {', '.join(near)}"
+                f"{'.' if len(near) == len(known) else ', ... (conf/tracer has all).'}"
+            )
 
     def clip_settings(self) -> ClipSettings:
         """The clip settings of the tracer's configuration, overridden by `clips`."""
@@ -99,7 +105,7 @@ def run_sweep(
     folder.mkdir(parents=True, exist_ok=True)
     points, clips = config.points(), config.clip_settings()
     tracers = [
-        make_tracer({**config.tracer, **point}) for point in points
+        make_tracer(with_values(config.tracer, point)) for point in points
     ]  # a wrong value raises before the work starts
     work = [
         (suite, item)
@@ -170,7 +176,7 @@ def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, Valu
     parts = [
         scene,
         item.name,
-        settled({**config.tracer, **point}, width),
+        settled(with_values(config.tracer, point), width),
         dataclasses.asdict(dataclasses.replace(clips, stride=working_stride(width, clips.stride))),
         dataclasses.asdict(config.scores),
     ]

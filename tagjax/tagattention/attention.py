@@ -75,13 +75,6 @@ def _first_of_channel(reads: PhaseReads) -> Array:
     return jnp.argmax(same & reads.valid[None, :], axis=1)
 
 
-def read_support(reads: PhaseReads) -> Float[Array, ""]:
-    """Share of the reads left once every channel has spent one on its unknown offset; 0 without reads."""
-    first = reads.valid & (_first_of_channel(reads) == jnp.arange(reads.channel.shape[0]))
-    count, groups = (jnp.sum(flags.astype(reads.time_s.dtype)) for flags in (reads.valid, first))
-    return jnp.where(count > 0, (count - groups) / jnp.maximum(count, 1.0), 0.0)
-
-
 def coherent_score(
     rho_m: Float[Array, "rows columns window"],
     reads: PhaseReads,

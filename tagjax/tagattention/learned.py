@@ -27,9 +27,6 @@ PACKAGED = Path(__file__).parent / "weights"
 
 _FORMAT = "tagjax-tracer-parameters"
 _VERSION = 4
-_OLDER = (3,)
-"""Versions that are read as well: files of version 3 hold no static settings, which are then not compared."""
-
 _MAX_BYTES = 1_000_000
 _CHECKSUM = "sha256"
 
@@ -60,7 +57,7 @@ class Learned:
 
     path: Path
     settings: Mapping[str, Any]  # of the tracer, with the values that learning began from
-    static: Mapping[str, Any] | None  # settings that are not learned, by dotted name; None: of an older version
+    static: Mapping[str, Any]  # settings that are not learned, by dotted name
     clips: Mapping[str, Any]  # clip settings of the training: stride, window, flow, estimator, antennas
     parameters: Mapping[str, float]  # in physical units, by dotted name
     default: bool  # whether `default` may mean this file
@@ -138,8 +135,7 @@ def load_parameters(tracer: TracerT, source: str | Path, settings: Mapping[str, 
     found = read_learned(source, settings)
     _check_target(found, settings)
     wanted = _built(tracer, settings)
-    if found.static is not None:
-        _check_static(found.path, _static(wanted), found.static)
+    _check_static(found.path, _static(wanted), found.static)
     began = _began(tracer, found)
     learned, unmoved = dict(found.parameters), found.unmoved(began)
     for name, asked in wanted.physical().items():
@@ -231,7 +227,7 @@ def _default_for(settings: Mapping[str, Any] | None) -> Learned:
 
 def _read(path: Path) -> Learned:
     content = _content(path)
-    needed = ["settings", "clips", "parameters", *(["static"] if content["version"] == _VERSION else [])]
+    needed = ["settings", "static", "clips", "parameters"]
     if lacking := [name for name in needed if not isinstance(content.get(name), dict)]:
         raise ValueError(f"{path}: found no {', '.join(lacking)}; expected {', '.join(needed)}. Copy the file again.")
     wrong = [name for name, value in content["parameters"].items() if not _is_number(value)]
@@ -254,8 +250,7 @@ def _read(path: Path) -> Learned:
     if isinstance(flow := clips.get("flow"), str) and _is_file(path.parent / flow):
         clips["flow"] = str(path.parent / flow)
     parameters = {name: float(value) for name, value in content["parameters"].items()}
-    static = content["static"] if content["version"] == _VERSION else None
-    return Learned(path, content["settings"], static, clips, parameters, default)
+    return Learned(path, content["settings"], content["static"], clips, parameters, default)
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -271,10 +266,9 @@ def _content(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise ValueError(f"{path}: found JSON, but no learned parameters; expected the format {_FORMAT}.")
-    if content.get("version") not in (_VERSION, *_OLDER):
-        readable = " and ".join(str(version) for version in (*_OLDER, _VERSION))
+    if content.get("version") != _VERSION:
         raise ValueError(
-            f"{path}: version {reprlib.repr(content.get('version'))}; this release reads {readable}. Train again."
+            f"{path}: version {reprlib.repr(content.get('version'))}; this release reads {_VERSION}. Train again."
         )
     return content
 

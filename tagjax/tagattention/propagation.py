@@ -43,19 +43,3 @@ def propagate(
     Eq. 7 with forgetting = 1. A closed gate leaves the map as it is: what rests is remembered, not forgotten.
     """
     return forgetting**gate * carried + gate * evidence
-
-
-def soft_clip(value: Float[Array, "*batch"], limit: Float[Array, ""]) -> Float[Array, "*batch"]:
-    """limit * tanh(value / limit): log odds kept within what a later contradiction can undo."""
-    return limit * jnp.tanh(value / limit)
-
-
-def rival_log_odds(log_odds: Float[Array, "tag height width"]) -> Float[Array, "tag height width"]:
-    """How much less a pixel speaks for each tag if it can be only one tag's: log(1 + sum of the other tags' odds).
-
-    With log odds l_k of tag k against background, those of k against background and all other tags are l_k - log(1 +
-    sum_{j != k} exp(l_j)). Others count by what their odds exceed even ones: what nothing is known of has no rival.
-    """
-    odds = jnp.expm1(jnp.clip(log_odds, 0.0, 60.0))
-    others = 1.0 - jnp.eye(log_odds.shape[0], dtype=log_odds.dtype)
-    return jnp.log1p(jnp.einsum("jk,khw->jhw", others, odds))

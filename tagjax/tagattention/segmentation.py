@@ -5,16 +5,13 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 _FAR = 1e30
 
 
 class Segments(eqx.Module):
     """Soft K-means segments on a grid of cells: each pixel belongs to the 3 x 3 segments around its own cell.
-
-    With `objects` the pixels of each given object belong to one segment of its own, and to no other.
 
     `share` sums to 1 over its first axis for valid pixels and to 0 for the others; neighbour n of a pixel in cell
     (i, j) is the segment (i + n // 3 - 1, j + n % 3 - 1).
@@ -23,12 +20,6 @@ class Segments(eqx.Module):
     share: Float[Array, "9 height width"]
     weight: Float[Array, "rows columns"]  # pixels in each segment
     cell: int = eqx.field(static=True)
-    objects: Float[Array, "object height width"] | None = None  # membership of given objects, 0 or 1
-
-    @property
-    def num_cell_rows(self) -> int:
-        """Rows of the grid that are cells of the picture; given objects are segments in rows below these."""
-        return -(-self.share.shape[1] // self.cell)
 
 
 def _blocks(image: Float[Array, "height width channel"], cell: int) -> Float[Array, "channel rows cell columns cell"]:
@@ -72,20 +63,14 @@ def segment(
     *,
     cell: int,
     num_iterations: int = 3,
-    objects: Float[Array, "object height width"] | None = None,
 ) -> Segments:
     """Soft K-means of pixel features (3D position in metres first), seeded by cells of the picture.
-
-    Pixels of the given `objects` are segments of their own (`Segments.objects`).
 
     Assignments are softmax(-||f - c||^2 / (2 temperature^2)) over the nine nearest seeds (the local search of SLIC:
     Achanta et al., 2012), so the cost does not grow with the number of segments; temperature -> 0 is hard K-means
     (TagAttention, III.G, after Jaimez et al., 2017).
     """
     height, width, _ = features.shape
-    if objects is not None:
-        objects = jnp.where(valid[None], objects, 0.0)
-        valid = valid & (jnp.sum(objects, axis=0) == 0)
     known = _blocks(valid.astype(features.dtype)[..., None], cell)
     pixels = jnp.concatenate([_blocks(jnp.where(valid[..., None], features, 0.0), cell), known])
 
@@ -106,22 +91,7 @@ def segment(
         return centres(_summed(assign(seeds), pixels)), None
 
     seeds, _ = jax.lax.scan(iterate, centres(jnp.sum(pixels, axis=(2, 4))), None, length=num_iterations)
-    weight = seeds[-1]
-    if objects is not None:
-        weight = jnp.concatenate([weight, _below(jnp.sum(objects, axis=(1, 2))[:, None], weight.shape[1])[..., 0]])
-    return Segments(_whole(assign(seeds), height, width), weight, cell, objects)
-
-
-def _places(num: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Row below the cells, and column, of each given object: none is next to a cell or to another object."""
-    row, column = np.divmod(np.arange(num), -(-columns // 2))
-    return 2 * row + 1, 2 * column
-
-
-def _below(values: Float[Array, "object channel"], columns: int) -> Float[Array, "rows columns channel"]:
-    """Values of given objects as rows below the grid of cells; zero between them."""
-    row, column = _places(values.shape[0], columns)
-    return jnp.zeros((int(row[-1]) + 1, columns, values.shape[1]), values.dtype).at[row, column].set(values)
+    return Segments(_whole(assign(seeds), height, width), seeds[-1], cell)
 
 
 def pool(
@@ -131,9 +101,6 @@ def pool(
     stacked = jnp.concatenate([values * weight[..., None], weight[..., None]], axis=-1)
     share = _blocks(jnp.moveaxis(segments.share, 0, -1), segments.cell)
     summed = jnp.moveaxis(_summed(share, _blocks(stacked, segments.cell)), 0, -1)
-    if segments.objects is not None:
-        sums = jnp.einsum("ohw,hwc->oc", segments.objects, stacked)
-        summed = jnp.concatenate([summed, _below(sums, summed.shape[1])])
     mass = summed[..., -1]
     mean = summed[..., :-1] / jnp.where(mass > 1e-6, mass, 1.0)[..., None]
     return jnp.where(mass[..., None] > 1e-6, mean, 0.0), mass
@@ -143,60 +110,9 @@ def unpool(segments: Segments, grid: Float[Array, "rows columns channel"]) -> Fl
     """Segment values handed back to the pixels by their shares."""
     _, height, width = segments.share.shape
     share = _blocks(jnp.moveaxis(segments.share, 0, -1), segments.cell)
-    cells = grid[: segments.num_cell_rows]
-    near = jnp.stack(_shifted(jnp.moveaxis(cells, -1, 0)))
+    near = jnp.stack(_shifted(jnp.moveaxis(grid, -1, 0)))
     spread = jnp.einsum("nrycx,nfrc->frycx", share, near)
-    values = jnp.moveaxis(_whole(spread, height, width), 0, -1)
-    if segments.objects is None:
-        return values
-    row, column = _places(segments.objects.shape[0], grid.shape[1])
-    own = grid[segments.num_cell_rows :][row, column]
-    return values + jnp.einsum("ohw,oc->hwc", segments.objects, own)
-
-
-def membership(objects: Int[Array, "height width"], num: int) -> Float[Array, "object height width"]:
-    """Membership of pixels in objects that are numbered from 1 to `num`."""
-    return jnp.moveaxis(jax.nn.one_hot(objects - 1, num), -1, 0)
-
-
-def diffuse(
-    values: Float[Array, "rows columns"],
-    affinity: Float[Array, "9 rows columns"],
-    rate: Float[Array, ""],
-    *,
-    num_iterations: int = 4,
-) -> Float[Array, "rows columns"]:
-    """Let segments that belong together share their log odds: x <- (1 - rate) values + rate (affinity x), repeated.
-
-    `affinity` sums to at most 1 over its first axis. rate = 0 leaves the values alone. A limb that swings against the
-    body for a moment is held by the body.
-    """
-
-    def spread(x: Float[Array, "rows columns"], _: None):
-        near = jnp.concatenate(_shifted(x[None]))
-        return (1.0 - rate) * values + rate * jnp.sum(near * affinity, axis=0), None
-
-    out, _ = jax.lax.scan(spread, values, None, length=num_iterations)
-    return out
-
-
-def segment_affinity(
-    segments: Segments,
-    centre: Float[Array, "rows columns 3"],
-    step: Float[Array, "rows columns"],
-    length: Float[Array, ""],
-) -> Float[Array, "9 rows columns"]:
-    """How much each segment and its eight neighbours are one thing: near in 3D and moving alike; sums to 1.
-
-    `length` is in the units of `centre`; steps are in units of what still counts as alike.
-    """
-    alive = segments.weight > 1.0
-    told = jnp.concatenate([centre, step[..., None], alive.astype(step.dtype)[..., None]], axis=-1)
-    near = jnp.moveaxis(jnp.stack(_shifted(jnp.moveaxis(told, -1, 0))), 1, -1)
-    apart = jnp.sum(jnp.square(near[..., :3] - centre[None]), axis=-1) / (2.0 * length**2)
-    unlike = jnp.square(near[..., 3] - step[None]) / 2.0
-    raw = jnp.where((near[..., 4] > 0.5) & alive[None], jnp.exp(-apart - unlike), 0.0)
-    return raw / jnp.maximum(jnp.sum(raw, axis=0, keepdims=True), 1e-6)
+    return jnp.moveaxis(_whole(spread, height, width), 0, -1)
 
 
 def min_max(value: Float[Array, "height width"], valid: Bool[Array, "height width"]) -> Float[Array, "height width"]:
@@ -245,26 +161,6 @@ def cdf_corner(
     return jnp.sum(weight * edges) + (1.0 - jnp.sum(weight)) * 0.5
 
 
-def mean_shift(
-    points_m: Float[Array, "height width 3"],
-    weight: Float[Array, "height width"],
-    start_m: Float[Array, " 3"],
-    bandwidth_m: Float[Array, ""],
-    *,
-    num_iterations: int = 5,
-) -> Float[Array, " 3"]:
-    """The mode of weighted points next to `start_m`: Gaussian mean shift; the start where no weight is near."""
-
-    def shift(centre: Float[Array, " 3"], _: None):
-        kernel = weight * jnp.exp(-jnp.sum(jnp.square(points_m - centre[None, None]), axis=-1) / (2.0 * bandwidth_m**2))
-        total = jnp.sum(kernel)
-        mean = jnp.sum(points_m * kernel[..., None], axis=(0, 1)) / jnp.maximum(total, 1e-6)
-        return jnp.where(total > 1e-6, mean, centre), None
-
-    centre, _ = jax.lax.scan(shift, start_m, None, length=num_iterations)
-    return centre
-
-
 def cdf_cut(
     log_likelihood: Float[Array, "height width"],
     valid: Bool[Array, "height width"],
@@ -281,35 +177,6 @@ def cdf_cut(
     corner = cdf_corner(probability, valid, significance, width)
     mask = jax.nn.sigmoid((probability - corner) / (10.0 * width))
     return jnp.where(valid & (jnp.max(probability) > 0), mask, 0.0)
-
-
-def compact_cut(
-    points_m: Float[Array, "height width 3"],
-    valid: Bool[Array, "height width"],
-    log_odds: Float[Array, "height width"],
-    *,
-    level: Float[Array, ""],
-    share: Float[Array, ""],
-    margin: Float[Array, ""],
-    width: Float[Array, ""],
-    extent_m: Float[Array, ""],
-) -> tuple[Float[Array, "height width"], Float[Array, " 3"]]:
-    """A soft mask that is one compact thing in 3D, and its centre.
-
-    The mask is sigmoid((l - threshold - |p - c|^2 / (2 extent^2)) / width) with threshold = min(level + share
-    max(best - level, 0), best - margin),
-    where c is the mode (mean shift) of the points whose l passes, started at the best of them. No gradient goes through c.
-    """
-    best = jnp.max(jnp.where(valid, log_odds, -1e3))
-    threshold = jnp.minimum(level + share * jax.nn.relu(best - level), best - margin)
-    known = valid.astype(log_odds.dtype)
-    weight = jax.nn.sigmoid((log_odds - threshold) / width) * known
-    peak = jnp.where(valid, jnp.exp(jnp.minimum(log_odds - best, 0.0) / width), 0.0)
-    start = jnp.sum(points_m * peak[..., None], axis=(0, 1)) / jnp.maximum(jnp.sum(peak), 1e-6)
-    # Between two modes mean shift multiplies gradients by thousands, step by step; the mask's own edge says enough.
-    centre = jax.lax.stop_gradient(mean_shift(points_m, weight, start, extent_m))
-    spread = jnp.sum(jnp.square(points_m - centre[None, None]), axis=-1) / (2.0 * jnp.square(extent_m))
-    return jax.nn.sigmoid((log_odds - threshold - spread) / width) * known, centre
 
 
 def bounding_box(mask: Float[Array, "height width"], tail: float) -> Float[Array, " 4"]:

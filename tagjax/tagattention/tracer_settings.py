@@ -15,14 +15,13 @@ from ..core.settings import changed
 from ..tracing.clips import ClipSettings
 from ..tracing.tracer import AbstractTracer
 from . import TagAttention
+from ._differences import flat
 from .learned import LearnableTracer, load_parameters, read_learned
 from .literal import TagAttentionLiteral
 from .published import TagAttentionPublished
-from .segments import TagAttention as SegmentTagAttention
 
 TRACERS: dict[str, type[AbstractTracer]] = {
     "tagjax.tagattention.TagAttention": TagAttention,
-    "tagjax.tagattention.segments.TagAttention": SegmentTagAttention,
     "tagjax.tagattention.published.TagAttentionPublished": TagAttentionPublished,
     "tagjax.tagattention.literal.TagAttentionLiteral": TagAttentionLiteral,
 }
@@ -44,6 +43,21 @@ def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> Abst
             "weights=, or choose another tracer."
         )
     return load_parameters(tracer, weights, parameters)
+
+
+def setting_names(settings: Mapping[str, Any]) -> list[str]:
+    """The tracer's own settings by dotted name (`dwell.memory_s`)."""
+    own = {name: value for name, value in settings.items() if name not in ("_target_", "clips")}
+    return sorted(flat(own))
+
+
+def with_values(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with these values in place of their own, by dotted name."""
+    result = dict(settings)
+    for name, value in values.items():
+        part, _, rest = name.partition(".")
+        result[part] = with_values(result[part], {rest: value}) if rest else value
+    return result
 
 
 def tracer_clips(settings: Mapping[str, Any]) -> ClipSettings:

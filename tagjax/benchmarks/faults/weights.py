@@ -19,7 +19,7 @@ from .damaged_bytes import damaged_bytes
 from .outcome import Outcome, TimeLimitError, outcome, time_limit, unclear
 
 LIMIT_S = 20.0
-_SETTINGS = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+_SETTINGS = {"_target_": "tagjax.tagattention.TagAttention", "whole": None}
 _FILE = ArrayFile("fault-trial", 1, "arrays of the fault trial", "python -m experiments.fault_trial")
 _HOSTILE: tuple[str, ...] = (
     *(
@@ -51,7 +51,7 @@ def trial(number: int, seed: int, folder: Path) -> list[Outcome]:
 
 
 def _json_faults(number: int, rng: random.Random, folder: Path) -> list[str | None]:
-    tracer = TagAttention(cell=4)
+    tracer = TagAttention(whole=None)
     sound, path = folder / "sound.json", folder / "damaged.json"
     save_parameters(sound, tracer, _SETTINGS, {"stride": 2, "flow": "dis"}, {"seed": 3})
     content = sound.read_bytes()

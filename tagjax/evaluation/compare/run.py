@@ -107,7 +107,7 @@ def _cell(
             break
     if not tally.num:
         return Cell(suite, system, reason=reason)
-    labels = sorted({label for item in items if (label := systems.settings_label(system, item)) is not None})
+    labels = sorted({label for item in items if (label := systems.settings_label(system)) is not None})
     scores = tally.scores.result()
     arrays = [np.concatenate(parts) if parts else np.zeros(0) for parts in (tally.error_m, tally.false_alarms)]
     error_m, false_alarms = (part[np.isfinite(part)] for part in arrays)
@@ -135,7 +135,7 @@ def _score(
     detections: list[Detections] = []
     traces = _timed(systems.traces(system, item, recording, epcs), elapsed_s, detections)
     quiet = dataclasses.replace(settings, num_pictures=1)
-    result = score_traces(traces, recording, epcs, stride=systems.stride(system, item), settings=quiet)
+    result = score_traces(traces, recording, epcs, stride=systems.stride(system), settings=quiet)
     tally.scores = tally.scores.merge(result.scores())
     tally.num += 1
     # The first piece includes compilation and fills caches.

@@ -36,10 +36,9 @@ TABLE = "tabletop"
 
 @dataclasses.dataclass(frozen=True)
 class SystemSettings:
-    """The settings of every system. TagAttention has several settings by name; a suite's story selects one of them."""
+    """The settings of every system."""
 
-    tagattention: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # as under conf/tracer
-    settings_of: Mapping[str, str] = dataclasses.field(default_factory=dict)  # name in `tagattention`, by story
+    tagattention: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # as under conf/tracer
     tagattention_published: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     blobs: BlobSettings = dataclasses.field(default_factory=BlobSettings)
     tagvision: TagVisionSettings = dataclasses.field(default_factory=TagVisionSettings)
@@ -48,12 +47,6 @@ class SystemSettings:
     goller: GollerSettings = dataclasses.field(default_factory=GollerSettings)
     goller_calibration: str | None = None  # calibration.json of experiments.goller, with fitted widths and rates
     goller_grid: str | None = None  # otherwise: recording of a tag grid, from which only the antennas are calibrated
-
-    def __post_init__(self) -> None:
-        if unknown := sorted(set(self.settings_of.values()) - set(self.tagattention)):
-            raise ConfigError(
-                f"settings_of: found {', '.join(unknown)}; expected settings of TagAttention, some of {', '.join(self.tagattention)}."
-            )
 
 
 class Systems:
@@ -70,39 +63,24 @@ class Systems:
                 self._calibration = load_calibration(Path(settings.goller_calibration))
             except ValueError as error:
                 raise ConfigError(f"systems.goller_calibration: {error}") from error
-        self._tracers: dict[tuple[str, str | None], AbstractTracer] = {}
+        self._tracers: dict[str, AbstractTracer] = {}
 
-    def settings_name(self, name: str, item: Item) -> str | None:
-        """The name of TagAttention's settings for a recording, by its story; None for other systems.
-
-        Raises `ConfigError` for a story that is not in `settings_of`.
-        """
-        if name != "tagattention":
-            return None
-        story = item.variant.story or item.suite.story
-        if story not in self.settings.settings_of:
-            raise ConfigError(
-                f"{item.suite.name}: found no entry for the story {story!r} in systems.settings_of; expected one of TagAttention's "
-                f"settings, {', '.join(self.settings.tagattention)}."
-            )
-        return self.settings.settings_of[story]
-
-    def settings_label(self, name: str, item: Item) -> str | None:
-        """The settings that a system uses for a recording, as tables show it; None for a system with one setting only."""
+    def settings_label(self, name: str) -> str | None:
+        """The settings that a system uses, as tables show it; None for a system with one setting only."""
         if name == "goller":
             return "starting widths" if self.settings.goller_calibration is None else "fitted widths"
-        return self.settings_name(name, item)
+        return None
 
-    def stride(self, name: str, item: Item) -> int | None:
+    def stride(self, name: str) -> int | None:
         """The stride in pixels of a system's masks; None for that of the picture's width."""
-        settings = self._device_settings(name, item)
+        settings = self._device_settings(name)
         return 1 if settings is None else tracer_clips(settings).stride
 
     def traces(self, name: str, item: Item, recording: Recording, epcs: list[str]) -> Traces:
         """Frame numbers and traces. Raises `RecordingError` or `ValueError` where the method cannot apply."""
-        settings = self._device_settings(name, item)
+        settings = self._device_settings(name)
         if settings is not None:
-            return self._device((name, self.settings_name(name, item)), settings, recording, epcs)
+            return self._device(name, settings, recording, epcs)
         make: dict[str, Callable[[], Any]] = {
             "blobs": lambda: BlobTracer(self.settings.blobs),
             "tagvision": lambda: self._tagvision(item, recording),
@@ -117,19 +95,18 @@ class Systems:
             raise RecordingError(reason)
         return host_trace(tracer, recording, epcs=epcs)
 
-    def _device_settings(self, name: str, item: Item) -> Mapping[str, Any] | None:
+    def _device_settings(self, name: str) -> Mapping[str, Any] | None:
         """The tracer's settings of a system that runs compiled, on clips; None for the others."""
-        if name == "tagattention_published":
-            return self.settings.tagattention_published
-        settings_name = self.settings_name(name, item)
-        return None if settings_name is None else self.settings.tagattention[settings_name]
+        of_names = {
+            "tagattention": self.settings.tagattention,
+            "tagattention_published": self.settings.tagattention_published,
+        }
+        return of_names.get(name)
 
-    def _device(
-        self, key: tuple[str, str | None], settings: Mapping[str, Any], recording: Recording, epcs: list[str]
-    ) -> Traces:
-        if key not in self._tracers:
-            self._tracers[key] = make_tracer(settings)
-        tracer, clips = self._tracers[key], tracer_clips(settings)
+    def _device(self, name: str, settings: Mapping[str, Any], recording: Recording, epcs: list[str]) -> Traces:
+        if name not in self._tracers:
+            self._tracers[name] = make_tracer(settings)
+        tracer, clips = self._tracers[name], tracer_clips(settings)
         return trace_recording(
             tracer, recording, clip_loader(clips), epcs=epcs, settings=self.scores.supported_by(tracer)
         )

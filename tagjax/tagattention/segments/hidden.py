@@ -35,7 +35,7 @@ class HiddenState(eqx.Module):
     def nothing(num_tags: int) -> HiddenState:
         """No body yet."""
         zero = jnp.zeros((num_tags, 3))
-        return HiddenState(jnp.full(num_tags, _NOTHING), zero, zero, jnp.zeros(num_tags))
+        return HiddenState(jnp.full(num_tags, _NOTHING, float), zero, zero, jnp.zeros(num_tags))
 
 
 class HiddenBody(eqx.Module):

@@ -27,7 +27,7 @@ class PastMotion(eqx.Module):
             raise ValueError(f"num_entries is {num_entries}; expected at least 2.")
         return PastMotion(
             displacement_m=jnp.zeros((num_entries, num_segments, 3)),
-            time_s=jnp.full(num_entries, -jnp.inf),
+            time_s=jnp.full(num_entries, -jnp.inf, float),
             newest=jnp.zeros((), jnp.int32),
             span_s=span_s,
         )
