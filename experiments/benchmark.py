@@ -1,7 +1,7 @@
 """Measure the speed of the stages against peers in the same run; the last line is the result as JSON.
 
 python -m experiments.benchmark
-python -m experiments.benchmark tracer                # the tracer on segments, live: frames, parts, start, memory; minutes
+python -m experiments.benchmark tracer                # the tracer, live: frames, parts, start, memory; minutes
 python -m experiments.benchmark tracer tracer.recording=a.zarr tracer.processes=false
 python -m experiments.benchmark flow                  # the same as 'cases=[flow]'
 python -m experiments.benchmark training              # a training step against the clip's length; minutes

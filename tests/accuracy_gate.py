@@ -33,7 +33,7 @@ class Case:
 
 
 CASES = {
-    "walking people": Case("walkers", (), ("tracer=tagattention",)),
+    "walking people": Case("walkers", ("duration_s=8.0",), ("tracer=tagattention",)),
     "hand-held object": Case(
         "single_static",
         ("duration_s=3.5", "variants=[{name: box, settings: {kinds: [box]}}]"),

@@ -220,24 +220,6 @@ class ClipCycle:
         self._place = int(state["place"])
 
 
-def unread_frames(
-    time_s: np.ndarray, depth_m: np.ndarray, range_m: np.ndarray, backward_px: np.ndarray, *, num_window: int = 5
-) -> Frame:
-    """Frames of tags whose ranges (tag, antenna, time) the radio knows to 5 mm a window, without a single read."""
-    past = np.maximum(np.arange(len(time_s))[:, None] + np.arange(1 - num_window, 1), 0)
-    relative = jnp.asarray(np.moveaxis(range_m[..., past] - range_m[..., past[:, :1]], 2, 0), jnp.float32)
-    shape = (*relative.shape[:3], 4)
-    none = jnp.zeros(shape)
-    return Frame(
-        time_s=jnp.asarray(time_s, jnp.float32),
-        depth_m=jnp.asarray(depth_m, jnp.float32),
-        backward_px=jnp.asarray(backward_px, jnp.float32),
-        forward_px=jnp.asarray(-backward_px, jnp.float32),
-        radio=RadioWindow(relative, jnp.full(relative.shape, 0.005)),
-        reads=PhaseReads(none, none, none, none, jnp.zeros(shape, jnp.int32), jnp.zeros(shape, bool)),
-    )
-
-
 def stored(folder: Path, num_frames: int) -> list[str]:
     """Paths of two enlarged recordings, written into a folder."""
     paths = [str(folder / f"scene{seed}.zarr") for seed in range(2)]

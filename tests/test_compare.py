@@ -43,7 +43,7 @@ def _config(suites: list[str], **changes: Any) -> CompareConfig:
 
 
 CELLS = [
-    Cell("a", "tagattention", 2, 40, 0.9, 0.61, 12.3, 45.6, 1.0, None, 7.8, settings="people"),
+    Cell("a", "tagattention", 2, 40, 0.9, 0.61, 12.3, 45.6, 1.0, None, 7.8, settings="quick"),
     Cell("a", "tagview", reason="the camera looks along the room", paper="0.97 of theirs"),
     Cell("b", "tagattention", 1, 10, 0.5, None, None, None, 0.0, 0.25, 8.0),
 ]
@@ -60,7 +60,7 @@ def test_the_table_holds_values_reasons_and_results_of_the_papers():
     table, legend = markdown(CELLS).split("\n\n", maxsplit=1)
     lines = table.splitlines()
     assert len({line.count("|") for line in lines}) == 1
-    assert lines[2] == "| `a` | tagattention (people) | 0.900 | 0.610 | 12 | 46 | 1.000 | - | 8 | 2 |  |"
+    assert lines[2] == "| `a` | tagattention (quick) | 0.900 | 0.610 | 12 | 46 | 1.000 | - | 8 | 2 |  |"
     assert "does not apply: the camera looks along the room" in lines[3]
     assert lines[3].endswith("| 0.97 of theirs |")
     assert " 0.250 " in lines[4]
@@ -71,13 +71,13 @@ def test_the_table_holds_values_reasons_and_results_of_the_papers():
     text = _printed(table)
     assert "(1) does not apply: the camera" in text
     assert "tagview, result of its paper, a: 0.97 of theirs" in text
-    assert "tagattention (people): a" in text
+    assert "tagattention (quick): a" in text
 
 
 def test_no_name_or_value_is_cut_on_eighty_columns():
     """For all suites and systems, with the widest values that can be expected."""
     cells = [
-        Cell(path.stem, system, 12, 1234, 0.912, 0.934, 123.4, 1234.5, 0.956, 0.978, 1234.5, settings="handheld")
+        Cell(path.stem, system, 12, 1234, 0.912, 0.934, 123.4, 1234.5, 0.956, 0.978, 1234.5, settings="fitted widths")
         for path in (CONF / "suite").glob("*.yaml")
         for system in NAMES
     ]

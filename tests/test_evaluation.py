@@ -221,7 +221,7 @@ def test_what_is_thin_at_its_ends_is_boxed_whole() -> None:
 def _box_of_the_true_mask(labels: np.ndarray, stride: int) -> np.ndarray:
     mask = jnp.asarray(labels[::stride, ::stride] == 1, jnp.float32)[None]
     none = jnp.zeros((1, *mask.shape[1:]))
-    found = describe(mask, jnp.zeros((1, 3)), none, none[0] > 0, jnp.ones(1), 0.0)
+    found = describe(mask, jnp.zeros((1, 3)), none, none[0] > 0)
     return box_to_picture(np.asarray(found.box_px[0]), stride, *labels.shape)
 
 

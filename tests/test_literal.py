@@ -127,13 +127,15 @@ def test_motion_maps_follow_a_shift():
     assert not motion.valid[:, :2, 2].any()
 
 
-def test_even_odds_are_no_claim():
-    mask, nothing = jnp.ones((3, 4, 5)), jnp.zeros((3, 3))
-    confidence = jnp.asarray([0.5, 0.503, 0.51])
-    out = describe(mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
-    assert out.detected.tolist() == [False, False, True]
-    empty = describe(0.0 * mask, nothing, jnp.zeros((1, 4, 5)), jnp.ones((4, 5), bool), confidence, 0.0)
-    assert not empty.detected.any()
+def test_a_tag_is_detected_where_its_mask_has_a_pixel():
+    nothing, known = jnp.zeros((2, 3)), jnp.ones((4, 5), bool)
+    mask = jnp.zeros((2, 4, 5)).at[1, 2, 3].set(1.0)
+    out = describe(mask, nothing, jnp.zeros((1, 4, 5)), known)
+    assert out.detected.tolist() == [False, True]
+    assert out.confidence.tolist() == [0.0, 1.0]
+    np.testing.assert_array_equal(out.box_px, [[0, 0, 0, 0], [3, 2, 3, 2]])
+    soft = describe(0.4 * mask, nothing, jnp.zeros((1, 4, 5)), known)
+    assert not soft.detected.any()
 
 
 def test_only_frames_and_reads_enter(clip):

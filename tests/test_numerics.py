@@ -5,8 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import special
 
-from tagjax.core.numerics import cos_sin
+from tagjax.core.numerics import cos_sin, log_i0
 
 
 def test_cos_sin_is_numpys():
@@ -24,3 +25,8 @@ def test_the_derivatives_of_cos_sin_are_minus_sin_and_cos():
         cos, sin = jax.jvp(jax.jit(cos_sin), (at,), (jnp.ones_like(at),))[1]
     np.testing.assert_allclose(cos, -np.sin(angle), atol=1e-9)
     np.testing.assert_allclose(sin, np.cos(angle), atol=1e-9)
+
+
+def test_log_i0_is_scipys():
+    x = np.array([0.0, 1e-3, 0.5, 3.0, 30.0, 400.0])
+    np.testing.assert_allclose(log_i0(jnp.asarray(x, jnp.float32)), np.log(special.i0e(x)) + x, rtol=1e-5, atol=1e-6)

@@ -28,9 +28,8 @@ from tagjax.evaluation.reads_ceiling.run import ceilings
 from tagjax.evaluation.true_distance import at_times, true_distance_m
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.radio.noise import thermal_sigma_rad
-from tagjax.radio.reads import PhaseReads
+from tagjax.radio.reader_model import ReaderModel
 from tagjax.recording import RecordingError, TagReads
-from tagjax.tagattention.phases import PhaseNoise, Phasor, explain, fresh_reads
 
 RSSI_DBM = -55.0
 PLAIN = EvidenceSettings(spread_rad=0.1, slack=0.0, doubled_angle=False)
@@ -111,33 +110,23 @@ def test_pi_flips_count_only_without_the_doubled_angle() -> None:
 
 
 def test_one_dwell_is_what_the_tracer_accumulates_read_by_read() -> None:
-    """`tagjax.tagattention.phases.explain` frame by frame, without outliers."""
+    """`tagjax.radio.reader_model` read by read, without outliers, and with a motion whose error is negligible."""
     rng = np.random.default_rng(3)
-    rate_hz, num_frames = 30.0, 12
-    time_s = np.sort(rng.uniform(0.01, (num_frames - 1) / rate_hz, 16))
-    frame_s = np.arange(num_frames) / rate_hz
-    frame_m = 1.5 + 0.1 * np.sin(4 * frame_s)
-    distance_m = np.interp(time_s, frame_s, frame_m)
+    time_s = np.sort(rng.uniform(0.01, 0.4, 16))
+    distance_m = 1.5 + 0.1 * np.sin(4 * time_s)
     table = _reads(time_s, distance_m, np.full(16, 915e6), rng.normal(0, 0.2, 16))
-    settings = EvidenceSettings(spread_rad=0.07, slack=0.3)
-    expected = independent_evidence(read_phasors(table, time_s, distance_m[None], settings), frame_s[-1:])[0, 0]
+    settings = EvidenceSettings(spread_rad=0.07, slack=0.0)
+    expected = independent_evidence(read_phasors(table, time_s, distance_m[None], settings), time_s[-1:])[0, 0]
 
-    single = lambda values: jnp.asarray(values, jnp.float32)  # noqa: E731
-    sigma_rad = thermal_sigma_rad(table.rssi_dbm)
-    buffer = PhaseReads(
-        single(time_s),
-        single(table.phase_rad),
-        single(table.carrier_hz),
-        single(sigma_rad),
-        jnp.zeros(16, jnp.int32),
-        jnp.ones(16, bool),
-    )
-    noise = PhaseNoise(single(0.07**2), single(0.3), single(1e-12))
-    total, phasor, channel = 0.0, Phasor.nothing(()), jnp.asarray(-1, jnp.int32)
-    for before, now in zip(range(num_frames - 1), range(1, num_frames), strict=True):
-        fresh = fresh_reads(buffer, channel, single(frame_s[before]), single(frame_s[now]))
-        gain, phasor = explain(phasor, single(frame_m[now] - frame_m[before]), fresh, noise, doubled_angle=True)
-        total, channel = total + float(gain), fresh.channel
+    reader = ReaderModel(spread_rad=0.07, still_spread_rad=0.07, drift_m=1e-12, outlier=1e-6)
+    single = lambda value: jnp.asarray(value, jnp.float32)  # noqa: E731
+    weight = reader.concentration(single(RSSI_DBM), single(0.0))
+    total, real, imaginary = 0.0, single(0.0), single(0.0)
+    for phase_rad, moved_m in zip(table.phase_rad, np.diff(distance_m, prepend=distance_m[0]), strict=True):
+        real, imaginary = reader.moved(real, imaginary, single(moved_m), single(1.0), single(915e6))
+        gain, real, imaginary = reader.add_read(real, imaginary, weight, single(phase_rad))
+        total += float(gain)
+    assert abs(expected) > 5
     np.testing.assert_allclose(expected, total, rtol=2e-3)
 
 

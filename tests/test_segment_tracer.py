@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
-from synthetic_clips import BOXES, EPCS, recording
+from synthetic_clips import BOXES, CARRIER_HZ, EPCS, offset_m, recording
 
 from tagjax.core.build import build
+from tagjax.core.numerics import SPEED_OF_LIGHT_M_S
 from tagjax.recording import Intrinsics, Recording
 from tagjax.tagattention.segments import Segmenter, SegmentTracker, TagAttention
 from tagjax.tagattention.segments.attention import AttentionEvidence
@@ -118,6 +119,50 @@ def test_phases_that_no_object_explains_are_no_detection(clip, phase_rad, reason
     found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
     assert float(jnp.mean(found.detected)) <= 0.02
     assert float(jnp.mean(found.status[10:] == reason)) > 0.95
+
+
+def _followed(one: Recording, epc: str, label: int) -> Recording:
+    """The recording with the reads of a tag on this object."""
+    own, time_s = one.reads.epc == epc, one.reads.time_ns * 1e-9
+    phase_rad = np.mod(4 * np.pi * CARRIER_HZ / SPEED_OF_LIGHT_M_S * offset_m(label, time_s) + 1.0, 2 * np.pi)
+    return dataclasses.replace(
+        one, reads=dataclasses.replace(one.reads, phase_rad=np.where(own, phase_rad, one.reads.phase_rad))
+    )
+
+
+def test_two_tags_of_one_object_both_find_it(traced):
+    """The competition between tags is one of different objects."""
+    clip = clip_of(_followed(scene(), "tag-a", 2))
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, clip.frames)
+    assert bool(jnp.all(found.detected[30:]))
+    for tag in range(2):
+        np.testing.assert_allclose(found.box_px[30:, tag], traced.box_px[30:, 1], atol=1.0)
+
+
+def test_tags_in_another_order_are_traced_alike(clip, traced):
+    turned = jax.tree.map(lambda leaf: leaf[:, ::-1], (clip.frames.radio, clip.frames.reads, clip.frames.present))
+    of = lambda f: (f.radio, f.reads, f.present, f.arrivals.tag)  # noqa: E731
+    frames = eqx.tree_at(of, clip.frames, (*turned, 1 - clip.frames.arrivals.tag))
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
+    np.testing.assert_array_equal(found.status[:, ::-1], traced.status)
+    np.testing.assert_allclose(found.mask[:, ::-1], traced.mask, atol=1e-4)
+    np.testing.assert_allclose(found.confidence[:, ::-1], traced.confidence, atol=1e-4)
+
+
+def test_the_time_of_the_first_frame_does_not_matter(clip, traced):
+    later = jax.tree.map(lambda leaf: leaf + 8.0, (clip.frames.time_s, clip.frames.arrivals.time_s))
+    frames = eqx.tree_at(lambda f: (f.time_s, f.arrivals.time_s), clip.frames, later)
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
+    np.testing.assert_array_equal(found.status, traced.status)
+    np.testing.assert_allclose(found.mask, traced.mask, atol=1e-2)
+    np.testing.assert_allclose(found.box_px, traced.box_px, atol=1e-2)
+
+
+def test_without_reads_nothing_is_detected(clip):
+    frames = eqx.tree_at(lambda f: f.arrivals.valid, clip.frames, jnp.zeros_like(clip.frames.arrivals.valid))
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
+    assert not bool(jnp.any(found.detected))
+    assert bool(jnp.all(found.status == Status.NOT_READ))
 
 
 def test_a_given_object_is_outlined_as_it_is_given(clip, traced):

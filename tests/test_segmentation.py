@@ -10,9 +10,9 @@ from tagjax.tagattention import segmentation
 
 # Compiled as a whole: as single operations most of the time would go into compiling each.
 segment = jax.jit(segmentation.segment, static_argnames=("cell", "num_iterations"))
-bounding_box = jax.jit(segmentation.bounding_box, static_argnames="tail")
-cdf_corner, min_max, pool, unpool = map(
-    jax.jit, (segmentation.cdf_corner, segmentation.min_max, segmentation.pool, segmentation.unpool)
+bounding_box, cdf_corner, min_max, pool, unpool = map(
+    jax.jit,
+    (segmentation.bounding_box, segmentation.cdf_corner, segmentation.min_max, segmentation.pool, segmentation.unpool),
 )
 
 
@@ -136,11 +136,9 @@ def test_corner_moves_smoothly_and_defaults_to_one_half():
     np.testing.assert_allclose(cdf_corner(probability, valid, jnp.asarray(0.9), jnp.asarray(1e-4)), 0.5, atol=1e-4)
 
 
-def test_box_of_a_binary_mask_is_exact_and_a_tail_drops_strays():
+def test_box_of_a_binary_mask_is_exact():
     mask = jnp.zeros((20, 30)).at[5:11, 7:19].set(1.0)
-    np.testing.assert_array_equal(bounding_box(mask, 0.0), [7, 5, 18, 10])
-    stray = mask.at[19, 29].set(1.0)
-    np.testing.assert_array_equal(bounding_box(stray, 0.0), [7, 5, 29, 19])
-    np.testing.assert_array_equal(bounding_box(stray, 0.02), [7, 5, 18, 10])
-    np.testing.assert_array_equal(bounding_box(mask.at[:].set(1.0), 0.0), [0, 0, 29, 19])
-    np.testing.assert_array_equal(bounding_box(jnp.zeros((4, 4)), 0.02), jnp.zeros(4))
+    np.testing.assert_array_equal(bounding_box(mask), [7, 5, 18, 10])
+    np.testing.assert_array_equal(bounding_box(mask.at[19, 29].set(1.0)), [7, 5, 29, 19])
+    np.testing.assert_array_equal(bounding_box(mask.at[:].set(1.0)), [0, 0, 29, 19])
+    np.testing.assert_array_equal(bounding_box(jnp.zeros((4, 4))), jnp.zeros(4))

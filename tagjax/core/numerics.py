@@ -68,12 +68,3 @@ def squared_distance(one: Float[Array, "one 3"], other: Float[Array, "other 3"])
 def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """log I0(x) for x >= 0, without overflow."""
     return jnp.log(jax.scipy.special.i0e(x)) + x
-
-
-def logit(probability: float) -> float:
-    """Log odds of a probability in (0, 1), the initial value of an unconstrained parameter. Raises `ValueError`
-    otherwise.
-    """
-    if not 0.0 < probability < 1.0:
-        raise ValueError(f"The probability is {probability}; expected a value strictly between 0 and 1.")
-    return float(jnp.log(probability) - jnp.log1p(-probability))

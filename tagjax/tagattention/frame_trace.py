@@ -9,19 +9,17 @@ from jaxtyping import Array, Bool, Float
 from ..tracing.tracer import Trace
 from .segmentation import bounding_box
 
-DETECTION_THRESHOLD = 0.505
-"""Confidence above which a tag counts as detected. Without evidence the confidence of a stationary tag stays within 0.005 of 0.5."""
-
 
 def describe(
     mask: Float[Array, "tag height width"],
     centre_m: Float[Array, "tag 3"],
     step_m: Float[Array, "antenna height width"],
     recent: Bool[Array, "height width"],
-    confidence: Float[Array, " tag"],
-    box_tail: float,
 ) -> Trace:
-    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distances."""
+    """The `Trace` of one frame from soft masks: box, centroid, and the mask-weighted change of distances.
+
+    The published method has no confidence: it is 1 where the mask is not empty.
+    """
     hard = jnp.where(mask > 0.5, mask, 0.0)
     total = jnp.sum(hard, axis=(1, 2))
     height, width = mask.shape[1:]
@@ -32,10 +30,10 @@ def describe(
     change = jnp.einsum("thw,ahw->ta", moving, step_m) / jnp.maximum(jnp.sum(moving, axis=(1, 2)), 1e-6)[:, None]
     return Trace(
         mask=mask,
-        box_px=jax.vmap(lambda m: bounding_box(m, box_tail))(hard),
+        box_px=jax.vmap(bounding_box)(hard),
         centre_px=jnp.stack([x, y], axis=-1),
         centre_m=centre_m,
         step_m=change,
-        confidence=confidence,
-        detected=(confidence > DETECTION_THRESHOLD) & (total > 0),
+        confidence=jnp.where(jnp.sum(mask, axis=(1, 2)) > 0, 1.0, 0.0),
+        detected=total > 0,
     )

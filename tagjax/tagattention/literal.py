@@ -103,9 +103,7 @@ class TagAttentionLiteral(AbstractTracer):
         centre = jnp.einsum("thw,hwc->tc", mask, points) / total[:, None]
         recent = motion.valid[..., -1] & motion.valid[..., -2]
         step_m = jnp.where(recent, motion.distance_m[..., -1] - motion.distance_m[..., -2], 0.0)
-        confidence = jnp.where(jnp.sum(mask, axis=(1, 2)) > 0, 1.0, 0.0)
-        trace = describe(mask, centre, step_m[None], recent, confidence, 0.0)
-        return LiteralState(motion, time_s, likelihood), trace
+        return LiteralState(motion, time_s, likelihood), describe(mask, centre, step_m[None], recent)
 
     def finish(self, state: LiteralState) -> LiteralState:
         return state

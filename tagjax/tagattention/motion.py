@@ -12,8 +12,8 @@ from ..image.warp import splat
 class MotionMap(eqx.Module):
     """Distances to the antenna over a window of frames, oldest first; the last is the current frame's."""
 
-    distance_m: Float[Array, "*antenna height width window"]
-    valid: Bool[Array, "*antenna height width window"]
+    distance_m: Float[Array, "height width window"]
+    valid: Bool[Array, "height width window"]
 
 
 def empty_motion(height: int, width: int, num_window: int) -> MotionMap:

@@ -179,22 +179,14 @@ def cdf_cut(
     return jnp.where(valid & (jnp.max(probability) > 0), mask, 0.0)
 
 
-def bounding_box(mask: Float[Array, "height width"], tail: float) -> Float[Array, " 4"]:
-    """Box x0 y0 x1 y1 (first and last pixel, both inside) that leaves at most the share `tail` of the mask outside on each side.
+def bounding_box(mask: Float[Array, "height width"]) -> Float[Array, " 4"]:
+    """Box x0 y0 x1 y1 (first and last pixel, both inside) of the pixels that are not 0; zeros if there are none."""
 
-    tail = 0 is the exact bounding box of a binary mask; a small tail keeps a stray pixel from stretching it, and takes
-    off what is thin at an end. An empty mask gives zeros.
-    """
+    def span(occupied: Bool[Array, " size"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        first, from_end = jnp.argmax(occupied), jnp.argmax(jnp.flip(occupied))
+        last = jnp.where(jnp.any(occupied), occupied.shape[0] - 1 - from_end, 0)
+        return first.astype(mask.dtype), last.astype(mask.dtype)
 
-    def span(profile: Float[Array, " size"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        total = jnp.sum(profile)
-        below = jnp.cumsum(profile)
-        above = jnp.flip(jnp.cumsum(jnp.flip(profile)))
-        first = jnp.sum(below <= tail * total + 1e-6 * total)
-        last = profile.shape[0] - 1 - jnp.sum(above <= tail * total + 1e-6 * total)
-        some = total > 0
-        return jnp.where(some, first, 0).astype(mask.dtype), jnp.where(some, last, 0).astype(mask.dtype)
-
-    x0, x1 = span(jnp.sum(mask, axis=0))
-    y0, y1 = span(jnp.sum(mask, axis=1))
+    x0, x1 = span(jnp.any(mask != 0, axis=0))
+    y0, y1 = span(jnp.any(mask != 0, axis=1))
     return jnp.stack([x0, y0, x1, y1])

@@ -1,4 +1,4 @@
-"""How fast the tracer on segments runs live, against the aims set for it and against its NumPy twin."""
+"""How fast the tracer runs live, against the aims set for it and against its NumPy twin."""
 
 from .figures import TracerSpeedSettings as TracerSpeedSettings
 from .figures import tracer_figures as tracer_figures

@@ -1,4 +1,4 @@
-"""The figures of the tracer on segments, each beside its aim."""
+"""The figures of the tracer, each beside its aim."""
 
 from __future__ import annotations
 

@@ -107,7 +107,6 @@ def _cell(
             break
     if not tally.num:
         return Cell(suite, system, reason=reason)
-    labels = sorted({label for item in items if (label := systems.settings_label(system)) is not None})
     scores = tally.scores.result()
     arrays = [np.concatenate(parts) if parts else np.zeros(0) for parts in (tally.error_m, tally.false_alarms)]
     error_m, false_alarms = (part[np.isfinite(part)] for part in arrays)
@@ -123,7 +122,7 @@ def _cell(
         scores.get("p_d"),
         float(np.mean(false_alarms)) if len(false_alarms) else None,
         float(np.median(tally.frame_ms)),
-        settings=", ".join(labels) or None,
+        settings=systems.settings_label(system),
     )
 
 

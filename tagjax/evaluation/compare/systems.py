@@ -97,11 +97,11 @@ class Systems:
 
     def _device_settings(self, name: str) -> Mapping[str, Any] | None:
         """The tracer's settings of a system that runs compiled, on clips; None for the others."""
-        of_names = {
+        compiled = {
             "tagattention": self.settings.tagattention,
             "tagattention_published": self.settings.tagattention_published,
         }
-        return of_names.get(name)
+        return compiled.get(name)
 
     def _device(self, name: str, settings: Mapping[str, Any], recording: Recording, epcs: list[str]) -> Traces:
         if name not in self._tracers:

@@ -5,7 +5,7 @@ noise of concentration w_r the reads of a dwell have the phasor and the log like
 
     S = sum_r w_r exp(j m (phi_r - 4 pi f_r d(t_r) / c)) ,    log I0(|S|) - sum_r log I0(w_r) ,
 
-the flat prior of the offset integrated out; m = 2 takes phases modulo pi. `tagjax.tagattention.phases` accumulates the
+the flat prior of the offset integrated out; m = 2 takes phases modulo pi. `tagjax.radio.reader_model` accumulates the
 same quantity read by read.
 """
 
@@ -28,7 +28,7 @@ NUM_SLOPES = 201
 
 @dataclasses.dataclass(frozen=True)
 class EvidenceSettings:
-    """How reads become evidence. The noise is that of the tracer for hand-held objects (conf/tracer)."""
+    """How reads become evidence. `spread_rad` is that of the tracer (conf/tracer/tagattention.yaml)."""
 
     spread_rad: float = 0.064  # standard deviation of a phase that the motion explains, beside thermal noise
     slack: float = 0.32  # the same as a fraction of the motion since the dwell's first read: reflections

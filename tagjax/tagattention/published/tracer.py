@@ -132,7 +132,7 @@ class TagAttentionPublished(AbstractTracer):
         number = jnp.sum(mask, axis=(1, 2))
         centre = jnp.einsum("thw,hwc->tc", mask, points) / jnp.maximum(number, 1.0)[:, None]
         step_m = jnp.where(known[..., -1] & valid, range_m - history[..., -1], 0.0)
-        trace = describe(mask, centre, step_m[None], known[..., -1] & valid, jnp.where(number > 0, 1.0, 0.0), 0.0)
+        trace = describe(mask, centre, step_m[None], known[..., -1] & valid)
         after = PublishedState(range_m, history, known, time_s, likelihood, centres, state.num_frames + 1)
         return after, trace
 
