@@ -139,6 +139,16 @@ def test_two_tags_of_one_object_both_find_it(traced):
         np.testing.assert_allclose(found.box_px[30:, tag], traced.box_px[30:, 1], atol=1.0)
 
 
+def test_a_tag_alone_is_traced_as_it_is_among_others(clip, traced):
+    alone = jnp.broadcast_to(jnp.asarray([True, False]), clip.frames.present.shape)
+    valid = clip.frames.arrivals.valid & (clip.frames.arrivals.tag == 0)
+    frames = eqx.tree_at(lambda f: (f.present, f.arrivals.valid), clip.frames, (alone, valid))
+    found = eqx.filter_jit(trace)(TRACER, clip.camera, frames)
+    assert not bool(jnp.any(found.detected[:, 1]))
+    np.testing.assert_array_equal(found.detected[30:, 0], traced.detected[30:, 0])
+    np.testing.assert_array_equal(found.mask[30:, 0] > 0.5, traced.mask[30:, 0] > 0.5)
+
+
 def test_tags_in_another_order_are_traced_alike(clip, traced):
     turned = jax.tree.map(lambda leaf: leaf[:, ::-1], (clip.frames.radio, clip.frames.reads, clip.frames.present))
     of = lambda f: (f.radio, f.reads, f.present, f.arrivals.tag)  # noqa: E731

@@ -144,12 +144,17 @@ def test_every_parameter_has_a_finite_gradient_and_only_these_have_none(clip) ->
     by_name = dict(zip(names, leaves, strict=True))
     zero = {name for name, value in by_name.items() if value == 0.0}
     assert UNSEEN <= zero <= UNSEEN | {"body.most_against", "body.evidence_nats"}  # whose effect may vanish in float32
+
+
+@pytest.mark.ci
+def test_every_parameter_of_the_confidence_has_a_gradient_of_its_calibration() -> None:
     judged = dataclasses.replace(OBJECTIVE, contrast=0.0, coverage=0.0, calibration=1.0)
     # A temperature and a freshness at which no confidence is 0 or 1.
     unsure = Detection(temperature_nats=50.0, fresh_s=0.05)
     tracer, certain = eqx.tree_at(lambda t: t.detection, _tracer(), unsure), clip_of(_rough(), 0, 24)
     gradient, _ = clip_gradient(tracer, certain.camera, certain.frames, KEY, judged)
-    by_name = dict(zip(names, (float(leaf) for leaf in jax.tree.leaves(gradient)), strict=True))
+    values = (float(leaf) for leaf in jax.tree.leaves(gradient))
+    by_name = dict(zip(_tracer().physical(), values, strict=True))
     assert np.isfinite(list(by_name.values())).all()
     assert all(by_name[f"detection.{name}"] != 0 for name in LEARNED["detection"])
 

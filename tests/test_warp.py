@@ -36,16 +36,6 @@ def test_gather_agrees_with_opencv_remap():
     np.testing.assert_allclose(np.asarray(out)[inside, 0], expected[inside], atol=0.03 * np.ptp(image))
 
 
-def test_gather_leaves_invalid_pixels_out():
-    image = jnp.asarray([[[1.0], [100.0], [3.0]]])
-    valid = jnp.asarray([[True, False, True]])
-    flow = jnp.zeros((1, 3, 2)).at[0, 0, 0].set(0.25)
-    out, covered = gather(image, flow, valid)
-    assert out[0, 0, 0] == 1.0
-    assert covered.tolist() == [[True, False, True]]
-    assert out[0, 1, 0] == 0.0
-
-
 def test_gather_outside_the_picture_is_not_covered():
     _, covered = gather(jnp.ones((4, 4, 1)), jnp.full((4, 4, 2), 10.0))
     assert not covered.any()
@@ -96,13 +86,6 @@ def test_splat_by_whole_pixels_moves_the_image_and_marks_the_hole():
     assert float(jnp.abs(out[-1]).max()) == 0.0
 
 
-def test_splat_importance_lets_the_nearer_win():
-    image = jnp.asarray([[[1.0], [2.0]]])
-    flow = jnp.zeros((1, 2, 2)).at[0, 0, 0].set(1.0)
-    out, _ = splat(image, flow, jnp.exp(-jnp.asarray([[1.0, 3.0]]) / 0.05))
-    np.testing.assert_allclose(out[0, 1, 0], 1.0, atol=1e-6)
-
-
 def test_splat_conserves_mass_inside():
     """Splat averages, so a pixel's mass is the weight that it receives times its value; none leaves the picture here."""
     rng = np.random.default_rng(3)
@@ -128,9 +111,8 @@ def test_gradients_agree_with_finite_differences(gradients_agree):
     image = _smooth((5, 6, 2))
     # Off the integers, where bilinear interpolation has its kinks.
     flow = np.random.default_rng(1).uniform(0.2, 0.8, (5, 6, 2))
-    importance = np.random.default_rng(2).uniform(0.5, 1.0, (5, 6))
     gradients_agree(lambda im, f: gather(im, f)[0][1:-2, 1:-2], (image, flow))
-    gradients_agree(lambda im, f, w: splat(im, f, w)[0], (image, flow, importance))
+    gradients_agree(lambda im, f: splat(im, f)[0], (image, flow))
 
 
 def test_jit_and_vmap_change_nothing():

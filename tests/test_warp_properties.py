@@ -92,9 +92,9 @@ def test_splat_conserves_mass_where_nothing_leaves_the_picture(image, flow):
     )
 
 
-@given(pictures(), flows_inside(), arrays(np.float32, (HEIGHT, WIDTH), elements=st.floats(0.125, 8.0, width=32)))
-def test_splat_stays_within_the_range_of_what_it_averages(image, flow, importance):
-    moved, filled = splat(jnp.asarray(image), jnp.asarray(flow), jnp.asarray(importance))
+@given(pictures(), flows_inside())
+def test_splat_stays_within_the_range_of_what_it_averages(image, flow):
+    moved, filled = splat(jnp.asarray(image), jnp.asarray(flow))
     inside = np.asarray(moved)[np.asarray(filled)]
     margin = 1e-4 * max(1.0, np.abs(image).max())
     assert inside.size > 0

@@ -66,16 +66,12 @@ def gather_taps(image: Float[Array, "height width channel"], flow_px: Float[Arra
 def gather(
     image: Float[Array, "height width channel"],
     flow_px: Float[Array, "height width 2"],
-    valid: Bool[Array, "height width"] | None = None,
 ) -> tuple[Float[Array, "height width channel"], Bool[Array, "height width"]]:
-    """Backward warp: sample `image` at `pixel + flow`, bilinearly, over valid pixels only.
+    """Backward warp: sample `image` at `pixel + flow`, bilinearly, over the picture's pixels only.
 
-    Returns the samples and a mask: where valid pixels have at least half of the bilinear weight; 0 elsewhere.
+    Returns the samples and a mask: where these have at least half of the bilinear weight; 0 elsewhere.
     """
     taps = gather_taps(image, flow_px)
-    if valid is not None:
-        known = gather_taps(valid.astype(image.dtype)[..., None], flow_px)
-        taps = [(value, weight * mark[..., 0]) for (value, weight), (mark, _) in zip(taps, known, strict=True)]
     total = functools.reduce(jnp.add, [weight for _, weight in taps])
     mixed = functools.reduce(jnp.add, [value * weight[..., None] for value, weight in taps])
     covered = total >= 0.5
@@ -85,19 +81,15 @@ def gather(
 def splat(
     image: Float[Array, "height width channel"],
     flow_px: Float[Array, "height width 2"],
-    importance: Float[Array, "height width"] | None = None,
 ) -> tuple[Float[Array, "height width channel"], Bool[Array, "height width"]]:
     """Forward warp: move every pixel by its flow and distribute it bilinearly over the four pixels around its target.
 
-    Where several pixels meet, they are averaged by bilinear weight times `importance` (all 1 if None; use
-    exp(-depth / scale) to favour the nearer, 0 to leave a pixel out: softmax splatting). Returns the image and the mask
-    of pixels that received a value; holes are 0 and False. Differentiable in image, flow and importance.
+    Where several pixels meet, they are averaged by bilinear weight. Returns the image and the mask of pixels that
+    received a value; holes are 0 and False. Differentiable in image and flow.
     """
     height, width, channels = image.shape
     x, y = pixel_grid(height, width, flow_px.dtype)
     index, weight = _taps(x + flow_px[..., 0], y + flow_px[..., 1], (height, width))
-    if importance is not None:
-        weight = weight * importance[None]
     rows = jnp.concatenate([image, jnp.ones((height, width, 1), image.dtype)], axis=-1)
     contribution = (rows[None] * weight[..., None]).reshape(-1, channels + 1)
     summed = jnp.zeros((height * width, channels + 1), image.dtype).at[index.reshape(-1)].add(contribution)
