@@ -14,7 +14,7 @@ from tagjax.evaluation.run import EvaluateConfig, run_evaluation
 from tagjax.training.optimizers import OPTIMIZERS, build_optimizer
 from tests.composed import settings
 
-TRACER = {"_target_": "tagjax.tagattention.TagAttention", "cell": 4}
+TRACER = {"_target_": "tagjax.tagattention.TagAttention"}
 ADAM = {"_target_": "optax.adam", "learning_rate": 0.01}
 
 CALLS = {
@@ -36,7 +36,7 @@ CALLS = {
         }
     },
     "nested in the tracer": {
-        "tracer": {**TRACER, "cell": {"_target_": "tagjax.core.files.write_atomic", "path": "{marker}", "content": ""}}
+        "tracer": {**TRACER, "dwell": {"_target_": "tagjax.core.files.write_atomic", "path": "{marker}", "content": ""}}
     },
     "in a baseline": {
         "baselines": {"x": {"_target_": "tagjax.core.files.write_atomic", "path": "{marker}", "content": ""}}
