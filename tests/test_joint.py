@@ -112,7 +112,7 @@ def test_the_loss_moves_as_its_gradient_says(clip):
         frames, camera = _in_double(clip.frames), _in_double(clip.camera)
         slope = jnp.linspace(0.0, 0.6, frames.depth_m.shape[2])
         frames = eqx.tree_at(lambda f: f.depth_m, frames, frames.depth_m + slope.reshape(1, 1, -1))
-        # Without coverage, whose pixels are followed to the nearest one: programs compiled apart round ties differently.
+        # Without coverage: it follows pixels to the nearest pixel, and two compiled programs may round a tie differently.
         objective = dataclasses.replace(OBJECTIVE, coverage=0.0, term_norms=True)
         gradient, logged = clip_gradient(model, camera, frames, KEY, objective)
         loss = lambda model: float(clip_loss(model, camera, frames, KEY, objective)["loss"])  # noqa: E731

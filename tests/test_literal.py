@@ -102,7 +102,7 @@ def test_paper_update_is_equation_7(clip):
 
 def test_the_soft_tracer_has_the_paper_as_its_limit(clip):
     frames = jax.tree.map(lambda leaf: leaf[:12], clip.frames)
-    # Without K-means, whose hard assignments tie in a scene seen through so long a lens.
+    # Without K-means: at this focal length many pixels are equally near to two centres, so hard assignments are chance.
     run = eqx.filter_jit(trace)
     paper = run(TagAttentionLiteral(refine=False), clip.camera, frames)
     gaps = []

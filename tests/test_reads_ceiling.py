@@ -110,7 +110,7 @@ def test_pi_flips_count_only_without_the_doubled_angle() -> None:
 
 
 def test_one_dwell_is_what_the_tracer_accumulates_read_by_read() -> None:
-    """`tagjax.radio.reader_model` read by read, without outliers, and with a motion whose error is negligible."""
+    """The sum that `tagjax.radio.reader_model` makes read by read, with outliers and errors of motion set to nearly 0."""
     rng = np.random.default_rng(3)
     time_s = np.sort(rng.uniform(0.01, 0.4, 16))
     distance_m = 1.5 + 0.1 * np.sin(4 * time_s)

@@ -87,7 +87,7 @@ def save_parameters(
     content = {
         "format": _FORMAT,
         "version": _VERSION,
-        "settings": _parameters_only(settings),
+        "settings": without_clips(settings),
         "static": _static(tracer),
         "clips": chosen,
         "parameters": tracer.physical(),
@@ -175,7 +175,7 @@ def _check_static(path: Path, asked: Mapping[str, Any], learned: Mapping[str, An
 
 def _built(tracer: TracerT, settings: Mapping[str, Any]) -> TracerT:
     """A tracer of the same class from other settings. Raises `ConfigError` for settings that it does not take."""
-    return build(_parameters_only(settings), {str(settings.get("_target_")): type(tracer)}, where="tracer")
+    return build(without_clips(settings), {str(settings.get("_target_")): type(tracer)}, where="tracer")
 
 
 def _began(tracer: LearnableTracer, found: Learned) -> dict[str, float]:
@@ -194,7 +194,8 @@ def _static(tracer: LearnableTracer) -> dict[str, Any]:
     return static_settings(tracer)
 
 
-def _parameters_only(settings: Mapping[str, Any]) -> dict[str, Any]:
+def without_clips(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that a tracer is built with: those of its configuration but for `clips`."""
     return {name: value for name, value in settings.items() if name != "clips"}
 
 
@@ -215,7 +216,7 @@ def _default_for(settings: Mapping[str, Any] | None) -> Learned:
     for one in found:
         if settings is None:
             return one
-        began, asked = flat(one.settings), flat(_parameters_only(settings))
+        began, asked = flat(one.settings), flat(without_clips(settings))
         if differences(asked, began).keys() <= one.unmoved(began):
             return one
     there = ", ".join(packaged_parameters()) or "none"

@@ -16,7 +16,7 @@ from ..tracing.clips import ClipSettings
 from ..tracing.tracer import AbstractTracer
 from . import TagAttention
 from ._differences import flat
-from .learned import LearnableTracer, load_parameters, read_learned
+from .learned import LearnableTracer, load_parameters, read_learned, without_clips
 from .literal import TagAttentionLiteral
 from .published import TagAttentionPublished
 
@@ -33,7 +33,7 @@ def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> Abst
 
     Raises `ConfigError` if the settings describe something else, `ValueError` for weights of a tracer that has none.
     """
-    parameters = {name: value for name, value in settings.items() if name != "clips"}
+    parameters = without_clips(settings)
     tracer: AbstractTracer = build(parameters, TRACERS, where="tracer")
     if weights is None:
         return tracer
@@ -47,8 +47,7 @@ def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> Abst
 
 def setting_names(settings: Mapping[str, Any]) -> list[str]:
     """The tracer's own settings by dotted name (`dwell.memory_s`)."""
-    own = {name: value for name, value in settings.items() if name not in ("_target_", "clips")}
-    return sorted(flat(own))
+    return sorted(flat(without_clips(settings)).keys() - {"_target_"})
 
 
 def with_values(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
