@@ -277,7 +277,7 @@ def test_a_suite_in_small(tmp_path: Path) -> None:
     )
     rows = run_budget(config, tmp_path / "out")
     assert [(row.tracer, row.truth) for row in rows] == [
-        (tracer, truth) for tracer in ("segments", "learnable", "published") for truth in ("none", "flow", "cut", "all")
+        (tracer, truth) for tracer in ("learnable", "published") for truth in ("none", "flow", "cut", "all")
     ]
     assert all(row.estimates["iou"].num_recordings == 1 for row in rows)
     written = json.loads((tmp_path / "out" / "result.json").read_text())
