@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from tagjax.benchmarks.segments_numpy.outline import filled_labels as filled_by_numpy
 from tagjax.tagattention.segments.outline import (
     dense_masks,
     filled_labels,
@@ -56,3 +58,32 @@ def test_a_pixel_between_surfaces_joins_the_neighbour_of_its_depth():
     depth = np.array([[1.0, 1.02, 2.0], [1.0, 1.5, 2.0], [1.0, 0.0, 2.0]], np.float32)
     filled = np.asarray(filled_labels(jnp.asarray(labels), jnp.asarray(depth)))
     np.testing.assert_array_equal(filled, [[1, 1, 2], [1, -1, 2], [1, -1, 2]])
+
+
+def test_a_gap_below_a_segment_is_filled_unless_one_sees_past_it():
+    labels = np.full((6, 5), -1, np.int32)
+    depth = np.zeros((6, 5), np.float32)
+    labels[0], depth[0] = [3, 3, 3, 3, 0], 2.0  # the last column: background above
+    labels[5], depth[5] = (
+        [0, 0, -1, 4, 0],
+        [2.1, 4.0, 0.0, 1.0, 2.0],
+    )  # floor, a wall far behind, nothing, something in front
+    filled = np.asarray(filled_labels(jnp.asarray(labels), jnp.asarray(depth)))
+    np.testing.assert_array_equal(filled[1:5, 0], 3)
+    np.testing.assert_array_equal(filled[1:5, 1], -1)
+    np.testing.assert_array_equal(filled[1:, 2], -1)
+    np.testing.assert_array_equal(filled[1:5, 3], 3)
+    np.testing.assert_array_equal(filled[1:5, 4], -1)
+    np.testing.assert_array_equal(filled[[0, 5]], labels[[0, 5]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_labels_are_filled_as_by_numpy(seed: int):
+    rng, shape = np.random.default_rng(seed), (23, 17)
+    labels = np.where(rng.random(shape) < 0.7, -1, rng.integers(0, 5, shape)).astype(np.int32)
+    depth = np.where((labels < 0) & (rng.random(shape) < 0.8), 0.0, rng.choice([1.0, 1.1, 1.3], shape)).astype(
+        np.float32
+    )
+    filled = np.asarray(filled_labels(jnp.asarray(labels), jnp.asarray(depth)))
+    np.testing.assert_array_equal(filled, filled_by_numpy(labels, depth))
+    assert np.sum(filled != labels) > 20

@@ -12,7 +12,7 @@ from ...tagattention.segments.cells import NO_LABEL
 def filled_labels(
     labels: Int[np.ndarray, "height width"], depth_m: Float[np.ndarray, "height width"]
 ) -> Int[np.ndarray, "height width"]:
-    """Labels in which pixels without one have that of a neighbour of nearly their depth."""
+    """Labels in which gaps have that of a neighbour of nearly their depth, or of the segment that hangs or stands there."""
     width = labels.shape[1] + 2
     label = np.pad(labels, 1, constant_values=NO_LABEL).ravel()
     depth = np.pad(depth_m, 1).ravel()
@@ -23,7 +23,17 @@ def filled_labels(
         joins = (out < 0) & (beside >= 0) & (np.abs(depth[at + step] - own) < original._SAME_SURFACE * own)
         np.copyto(out, beside, where=joins)
     label[at] = out
-    return label.reshape(-1, width)[1:-1, 1:-1]
+    filled = label.reshape(-1, width)[1:-1, 1:-1]
+    height, row = len(filled), np.arange(len(filled))[:, None]
+    gap = filled < 0
+    above = np.maximum.accumulate(np.where(gap, -1, row), axis=0)
+    below = np.minimum.accumulate(np.where(gap, height, row)[::-1], axis=0)[::-1]
+    rows, columns = np.nonzero(gap & (above >= 0) & (below < height))
+    top, bottom = above[rows, columns], below[rows, columns]
+    stands = depth_m[bottom, columns] < original._STANDS_ON * depth_m[top, columns]
+    hangs = stands & (filled[top, columns] > 0)
+    filled[rows[hangs], columns[hangs]] = filled[top, columns][hangs]
+    return filled
 
 
 def boxes_and_centroids(
