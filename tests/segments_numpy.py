@@ -33,12 +33,14 @@ class Memory:
     """The background model: one list of facts a pixel."""
 
     def __init__(self, height: int, width: int) -> None:
-        self.pixels = [{"c": 0.0, "n": 0, "age": 0.0, "b": 0.0, "deeper": 0.0} for _ in range(height * width)]
+        self.pixels = [
+            {"c": 0.0, "n": 0, "age": 0.0, "b": 0.0, "rested": 0.0, "deeper": 0.0} for _ in range(height * width)
+        ]
         self.shape, self.started = (height, width), False
 
     def step(self, depth: np.ndarray, valid: np.ndarray, flow: np.ndarray, dt: float, focal: float) -> dict:
         s = BACKGROUND
-        out = {name: np.zeros(self.shape, bool) for name in ("confirmed", "matched", "still", "early", "ripe")}
+        out = {name: np.zeros(self.shape, bool) for name in ("confirmed", "matched", "still", "front", "early", "ripe")}
         age = np.zeros(self.shape)
         for i, p in enumerate(self.pixels):
             at = np.unravel_index(i, self.shape)
@@ -53,6 +55,8 @@ class Memory:
                 wait = s["confirm_s"] * (10 if p["b"] > 0 and p["c"] < p["b"] - tolerance else 1)
                 if p["age"] >= wait:
                     p["b"] = p["c"]
+                if p["age"] > s["early_s"]:
+                    p["rested"] = max(p["rested"], p["c"])
             elif ok and not matched:
                 p.update(n=1, c=z, age=0.0 if self.started else s["early_s"])
             if ok:
@@ -61,6 +65,7 @@ class Memory:
             if p["deeper"] > max(s["reveal_s"], 1.5 * dt):
                 p["b"] = 0.0
             out["confirmed"][at] = ok and p["b"] > 0 and abs(z - p["b"]) < tolerance
+            out["front"][at] = ok and (p["rested"] == 0 or z < p["rested"] - 2 * tolerance)
             out["matched"][at], out["still"][at], age[at] = matched, still, p["age"]
             out["early"][at], out["ripe"][at] = p["age"] >= s["early_s"], p["age"] >= s["confirm_s"]
         self.started |= bool(valid.any())

@@ -73,7 +73,7 @@ def noisy(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def segment_frame(
-    centre_m, motion_m, *, area, life_s=0.0, displacement_m=None, source=None, size_m=0.06
+    centre_m, motion_m, *, area, life_s=0.0, displacement_m=None, source=None, size_m=0.06, front=1.0
 ) -> SegmentFrame:
     """A frame of segments with this motion, all of it known; slot 0 is the background. No pixels."""
     num_segments = len(area)
@@ -89,6 +89,7 @@ def segment_frame(
         life_s=jnp.broadcast_to(jnp.asarray(life_s, jnp.float32), (num_segments,)),
         displacement_m=motion_m if displacement_m is None else jnp.asarray(displacement_m, jnp.float32),
         moved=jnp.ones(num_segments, bool),
+        front=jnp.broadcast_to(jnp.asarray(front, jnp.float32), (num_segments,)),
         source=jnp.full(num_segments, -2, jnp.int32) if source is None else source,
         num_unplaced=jnp.zeros((), jnp.int32),
         background_lost=jnp.zeros(()),

@@ -18,7 +18,7 @@ def test_the_background_is_the_twins(seed: int) -> None:
     model, memory = Background(), plain.Memory(*shape)
     state, step = model.init(*shape), eqx.filter_jit(model.step)
     surfaces, shown = rng.uniform(0.5, 3, (4, *shape)), np.zeros(shape, int)
-    num_confirmed = np.zeros(30, int)
+    num_confirmed, num_front = np.zeros(30, int), np.zeros(30, int)
     for t in range(30):
         shown = np.where(rng.random(shape) < 0.03, rng.integers(0, 4, shape), shown)
         depth = np.take_along_axis(surfaces, shown[None], 0)[0] + rng.normal(0, 0.002, shape) + 0.002 * t
@@ -28,15 +28,16 @@ def test_the_background_is_the_twins(seed: int) -> None:
         dt = 0.11 + 0.01 * rng.random()
         state, view = step(state, jnp.asarray(depth), jnp.asarray(valid), jnp.asarray(flow), scalar(dt), scalar(focal))
         want = memory.step(depth, valid, flow, dt, focal)
-        for name in ("confirmed", "matched", "still", "early", "ripe"):
+        for name in ("confirmed", "matched", "still", "front", "early", "ripe"):
             np.testing.assert_array_equal(getattr(view, name), want[name], err_msg=f"{name} of frame {t}")
         np.testing.assert_allclose(view.age_s, want["age_s"], atol=1e-4)
-        num_confirmed[t] = want["confirmed"].sum()
+        num_confirmed[t], num_front[t] = want["confirmed"].sum(), (want["front"] & want["matched"]).sum()
     np.testing.assert_allclose(
         state.confirmed_m, np.reshape([p["b"] for p in memory.pixels], shape), atol=1e-5
     )  # fmt: skip
     assert num_confirmed[0] == 0
     assert 20 < num_confirmed.max() < 117
+    assert 5 < num_front[-1] < 80
 
 
 def test_a_shadow_on_a_confirmed_floor_is_static() -> None:

@@ -24,7 +24,7 @@ def person(speed_m_s: float = 1.0):
     moved = np.zeros((9, 3))
     moved[1:7, 0] = moved[8, 0] = speed_m_s * 0.67
     area = jnp.full(9, 20.0).at[0].set(900.0)
-    return segment_frame(centre, moved, area=area), jnp.asarray(moved, jnp.float32)
+    return segment_frame(centre, moved, area=area, life_s=2.0), jnp.asarray(moved, jnp.float32)
 
 
 def trunk(probability: float = 0.9):
@@ -52,6 +52,22 @@ def test_a_gap_ends_the_body():
     found, moved = person()
     found = eqx.tree_at(lambda one: one.centre_m, found, found.centre_m.at[5:7, 1].add(0.3))
     after = np.asarray(WholeBody(gap=3.0).completed(trunk(), found, moved, ELAPSED))[0]
+    assert (after[1:5] > 0.9).all()
+    assert (after[5:7] < 0.05).all()
+
+
+def test_a_young_segment_that_is_connected_belongs_to_a_body_that_travels():
+    found, moved = person()
+    young = eqx.tree_at(lambda one: one.life_s, found, found.life_s.at[jnp.array([7, 8])].set(0.1))
+    after = np.asarray(WholeBody().completed(trunk(), young, moved.at[7:].set(0.0), ELAPSED))[0]
+    assert after[7] > 0.9
+    assert after[8] < 0.05
+
+
+def test_what_is_not_in_front_of_the_surface_at_rest_is_a_shadow():
+    found, moved = person()
+    shadow = eqx.tree_at(lambda one: one.front, found, found.front.at[jnp.array([5, 6])].set(0.2))
+    after = np.asarray(WholeBody().completed(trunk(), shadow, moved, ELAPSED))[0]
     assert (after[1:5] > 0.9).all()
     assert (after[5:7] < 0.05).all()
 

@@ -19,6 +19,7 @@ class View:
     matched: Bool[np.ndarray, "height width"]
     age_s: Float[np.ndarray, "height width"]
     still: Bool[np.ndarray, "height width"]
+    front: Bool[np.ndarray, "height width"]
 
 
 def on_surface(depth_m: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
@@ -41,7 +42,7 @@ class Background:
         self.confirm_s, self.early_s = np.float32(settings.confirm_s), np.float32(settings.early_s)
         self.still_m_s, self.reveal_s = np.float32(settings.still_m_s), np.float32(settings.reveal_s)
         self.tolerance_m, self.tolerance_m_m2 = np.float32(settings.tolerance_m), np.float32(settings.tolerance_m_m2)
-        self.candidate_m, self.count, self.confirmed_m = (np.zeros((height, width), np.float32) for _ in range(3))
+        self.candidate_m, self.count, self.confirmed_m, self.rested_m = np.zeros((4, height, width), np.float32)
         self.resting_s, self.deeper_s = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
         self.started = False
 
@@ -77,5 +78,7 @@ class Background:
         revealed = self.deeper_s > max(self.reveal_s, np.float32(original._REVEAL_FRAMES) * dt_s)
         np.copyto(confirmed, np.float32(0), where=revealed)
         shown = valid & (confirmed > 0) & (np.abs(depth_m - confirmed) < tolerance)
+        np.maximum(self.rested_m, candidate, out=self.rested_m, where=seen & (age > self.early_s))
+        front = valid & ((self.rested_m <= 0) | (depth_m < self.rested_m - 2 * tolerance))
         self.started |= bool(valid.any())
-        return View(confirmed=shown, matched=matched, age_s=age, still=still)
+        return View(confirmed=shown, matched=matched, age_s=age, still=still, front=front)

@@ -22,22 +22,25 @@ class Whole:
         self, membership: Float[np.ndarray, "tag segment"], found: Segments, moved_m: np.ndarray, elapsed_s: np.ndarray
     ) -> None:
         """Complete memberships (probabilities) in place."""
-        speed_m_s = norm(moved_m) / np.maximum(elapsed_s, np.float32(0.5 * self.lag_s))
-        at = top(np.where(found.exists, speed_m_s, np.float32(0)), self.num_active)
+        one, zero = np.float32(1), np.float32(0)
+        speed_m_s = norm(moved_m) / np.maximum(elapsed_s, np.float32(self.lag_s))
+        travels = sigmoid((speed_m_s - self.travel_m_s) / (np.float32(0.2) * self.travel_m_s))
+        travels = np.where(found.exists, travels, zero)
+        joins = np.where(found.life_s < np.float32(self.lag_s), one, travels)
+        joins = np.where(found.exists & (found.front > np.float32(0.5)), joins, zero)
+        at = top(joins, self.num_active)
         at = at[found.exists[at]]
         if not len(at):
             return
-        travels = sigmoid((speed_m_s[at] - self.travel_m_s) / (np.float32(0.2) * self.travel_m_s))
-        body = connected(found.centre_m[at], self.gap * found.size_m[at], travels > 0.5)
-        total = membership @ found.area
-        own = membership[:, at]
-        going = own * (found.area[at] * travels)
-        share = going.sum(axis=1) / np.where(total != 0, total, 1)
-        goes = sigmoid((share - self.share) / np.float32(0.1))
+        body = connected(found.centre_m[at], self.gap * found.size_m[at], joins[at] > 0.5)
+        weight = membership * found.area
+        total = weight.sum(axis=1)
+        goes = sigmoid(((weight @ travels) / np.where(total != 0, total, 1) - self.share) / np.float32(0.1))
         members = (body[:, None] == np.arange(len(at))[None]).astype(np.float32)
-        same = body[None] == np.argmax(going @ members, axis=1)[:, None]
-        more = np.where(same, np.float32(whole._MOST) * goes[:, None] * travels[None], np.float32(0))
-        membership[:, at] = 1 - (1 - own) * (1 - more)
+        of_body = (weight * travels * joins)[:, at] @ members
+        same = body[None] == np.argmax(of_body, axis=1)[:, None]
+        more = np.where(same, np.float32(whole._MOST) * goes[:, None] * joins[at][None], zero)
+        membership[:, at] = 1 - (1 - membership[:, at]) * (1 - more)
 
 
 def connected(

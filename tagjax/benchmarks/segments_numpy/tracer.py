@@ -104,14 +104,17 @@ class NumpyTracer:
             )  # fmt: skip
             own.displaced(motion_m, change.source)
             labels, area, source = own.labels, own.area, change.source
+            in_front = np.bincount(labels[view.front & (labels >= 0)], minlength=num).astype(np.float32)
         else:  # a frame without depth leaves the segments as they are
             increment_m, motion_m = np.zeros((len(self.antennas_m), num), np.float32), np.zeros((num, 3), np.float32)
             labels, known = np.full(depth_m.shape, NO_LABEL, np.int32), np.arange(num) == STATIC
             area, source = np.zeros(num, np.float32), np.full(num, NOT_NEW, np.int32)
+            in_front = np.zeros(num, np.float32)
         size_m = np.sqrt(own.area) * own.centre_m[:, 2] / self.focal_px
         return Segments(
-            increment_m, motion_m, known, own.centre_m, area, size_m, own.life_s, own.displacement_m, source
-        ), labels
+            increment_m, motion_m, known, own.centre_m, area, size_m, own.life_s, own.displacement_m,
+            in_front / np.maximum(area, np.float32(1)), source,
+        ), labels  # fmt: skip
 
     def associate(
         self,

@@ -67,6 +67,7 @@ class Segments:
     size_m: Float[np.ndarray, " segment"]
     life_s: Float[np.ndarray, " segment"]
     displacement_m: Float[np.ndarray, "segment 3"]
+    front: Float[np.ndarray, " segment"]
     source: Int[np.ndarray, " segment"]
 
     @property

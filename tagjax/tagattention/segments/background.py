@@ -3,6 +3,8 @@
 Optical flow follows shadows and halos on floors and walls; their depth says that nothing moves. A pixel's depth is first
 a candidate. Seen for `confirm_s` without apparent motion it is confirmed, and stays so while something passes in front
 of it. A deeper surface that shows behind a confirmed one proves that the confirmed one has left.
+
+Long before that it is known what stands in front: where a deeper surface has been seen at rest.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ class BackgroundState(eqx.Module):
     count: Float[Array, "height width"]  # frames in that mean
     age_s: Float[Array, "height width"]  # time for which the candidate was seen at rest
     confirmed_m: Float[Array, "height width"]
+    rested_m: Float[Array, "height width"]  # the deepest surface seen at rest for `early_s`
     deeper_s: Float[Array, "height width"]  # time for which a surface behind the confirmed one is seen
     started: Bool[Array, ""]  # a frame with depth has been seen
 
@@ -39,13 +42,14 @@ class BackgroundView(eqx.Module):
     early: Bool[Array, "height width"]  # that age is enough for a pixel without a label
     ripe: Bool[Array, "height width"]  # ... enough to be confirmed
     still: Bool[Array, "height width"]  # no apparent motion
+    front: Bool[Array, "height width"]  # the depth is in front of all that has been seen at rest there
     lost: Float[Array, ""]  # fraction of the pixels with depth and a confirmed surface that show another; 0 without any
 
     @staticmethod
     def nothing(height: int, width: int) -> BackgroundView:
         """No pixel is known to be background."""
         no, zero = jnp.zeros((height, width), bool), jnp.zeros((height, width))
-        return BackgroundView(no, no, zero, no, no, no, jnp.zeros(()))
+        return BackgroundView(no, no, zero, no, no, no, ~no, jnp.zeros(()))
 
     def without(self, pixels: Bool[Array, "height width"]) -> BackgroundView:
         """The same, but these pixels are known not to be background."""
@@ -77,7 +81,7 @@ class Background(eqx.Module):
     def init(self, height: int, width: int) -> BackgroundState:
         """Nothing seen."""
         zero = jnp.zeros((height, width))
-        return BackgroundState(zero, zero, zero, zero, zero, jnp.zeros((), bool))
+        return BackgroundState(zero, zero, zero, zero, zero, zero, jnp.zeros((), bool))
 
     def step(
         self,
@@ -112,6 +116,9 @@ class Background(eqx.Module):
         revealed = deeper_s > jnp.maximum(self.reveal_s, _REVEAL_FRAMES * dt_s)
         confirmed = jnp.where(revealed, 0.0, confirmed)
 
+        rested = jnp.where(seen & (age > self.early_s), jnp.maximum(state.rested_m, candidate), state.rested_m)
+        # Both depths have their error.
+        front = valid & ((rested <= 0) | (depth_m < rested - 2.0 * tolerance))
         known = valid & (state.confirmed_m > 0)
         other_surface = known & (jnp.abs(depth_m - state.confirmed_m) >= tolerance)
         view = BackgroundView(
@@ -121,7 +128,8 @@ class Background(eqx.Module):
             early=age >= self.early_s,
             ripe=age >= self.confirm_s,
             still=still,
+            front=front,
             lost=safe_divide(jnp.sum(other_surface, dtype=depth_m.dtype), jnp.sum(known, dtype=depth_m.dtype)),
         )
         started = state.started | jnp.any(valid)
-        return BackgroundState(candidate, count, age, confirmed, deeper_s, started), view
+        return BackgroundState(candidate, count, age, confirmed, rested, deeper_s, started), view

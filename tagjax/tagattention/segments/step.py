@@ -12,7 +12,7 @@ from .background import Background, BackgroundState, BackgroundView
 from .carry import on_surface
 from .cells import NO_LABEL, NOT_NEW
 from .increments import segment_motion
-from .labels import Segmenter, SegmentState
+from .labels import Segmenter, SegmentState, slot_sums
 
 
 class SegmentFrame(eqx.Module):
@@ -28,6 +28,7 @@ class SegmentFrame(eqx.Module):
     life_s: Float[Array, " segment"]  # since birth
     displacement_m: Float[Array, "segment 3"]  # since birth
     moved: Bool[Array, " segment"]  # was ever displaced by `labels.moved_m`
+    front: Float[Array, " segment"]  # fraction of its pixels in front of all that has been seen at rest there
     source: Int[Array, " segment"]  # slot of the last frame that a new segment comes from, -1 = none; -2 = not new
     num_unplaced: Int[Array, ""]  # new segments that found no free slot
     background_lost: Float[
@@ -90,6 +91,8 @@ class SegmentTracker(eqx.Module):
             self.segmenter.max_change_m(dt_s), self.segmenter.num_segments, self.segmenter.min_measured,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
+        of_segment = valid & (segments.labels >= 0)
+        (in_front,) = slot_sums([view.front.astype(depth_m.dtype)], of_segment, segments.labels, segments.area.shape[0])
         seen = jnp.any(valid)
         kept = jax.tree.map(lambda new, old: jnp.where(seen, new, old), segments, state.segments)
         frame = SegmentFrame(
@@ -103,6 +106,7 @@ class SegmentTracker(eqx.Module):
             life_s=kept.life_s,
             displacement_m=kept.displacement_m,
             moved=kept.moved,
+            front=jnp.where(seen, in_front / jnp.maximum(segments.area, 1.0), 0.0),
             source=jnp.where(seen, found.source, NOT_NEW),
             num_unplaced=found.num_unplaced,
             background_lost=jax.lax.stop_gradient(view.lost),

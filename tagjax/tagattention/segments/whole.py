@@ -3,7 +3,10 @@
 The parts of a walking person move against each other, so that no rigid motion holds them together. But all of them get
 on, while the arm of someone who stays in place goes to and fro: over two thirds of a second its net displacement is small.
 So where most of a tag's body travels, the segments that travel too, and are connected with it by segments that travel,
-belong to it. Two segments are connected where their middles are not further apart than `gap` times their mean size.
+belong to it. Segments on legs hardly live for so long: those that are younger than that belong as well. What is not in
+front of the surface that has been seen at rest there is a shadow on it, and no part of a body.
+
+Two segments are connected where their middles are not further apart than `gap` times their mean size.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from ...core.parameters import check_positive
 from .step import SegmentFrame
 
 _ROUNDS = 6
-_FEW = 256  # segments that travel; in a crowd there are more
+_FEW = 256  # segments that may belong to bodies that travel; in a crowd there are more
 _MOST = 0.95  # probability that a connected segment belongs to the body
 
 
@@ -30,7 +33,7 @@ class WholeBody(eqx.Module):
     share: Fraction  # a body travels where so much of it does
     gap: float = eqx.field(static=True)  # of the middles of segments that are connected, in their mean size
     lag_s: float = eqx.field(static=True)
-    num_active: int = eqx.field(static=True)  # segments that are looked at: those that travel fastest
+    num_active: int = eqx.field(static=True)  # segments that are looked at: those that most likely travel
 
     def __init__(
         self,
@@ -57,24 +60,26 @@ class WholeBody(eqx.Module):
     ) -> Float[Array, "tag segment"]:
         """The membership (probabilities) with all of each body that travels.
 
-        `moved_m` is each segment's displacement over `lag_s`, or since its birth `elapsed_s` ago where that is shorter.
+        `moved_m` is each segment's displacement over `elapsed_s`: about `lag_s`, or since its birth where that is shorter. A young
+        segment has not travelled yet.
         """
         num_segments = found.area.shape[0]
         exists = (found.area > 0) & (jnp.arange(num_segments) > 0)
-        speed_m_s = jnp.where(exists, safe_norm(moved_m) / jnp.maximum(elapsed_s, 0.5 * self.lag_s), 0.0)
-        _, at = jax.lax.top_k(jax.lax.stop_gradient(speed_m_s), min(self.num_active, num_segments))
+        speed_m_s = safe_norm(moved_m) / jnp.maximum(elapsed_s, self.lag_s)
         limit_m_s = self.travel_m_s.value
-        travels = jnp.where(exists[at], jax.nn.sigmoid((speed_m_s[at] - limit_m_s) / (0.2 * limit_m_s)), 0.0)
-        body = self._connected(found.centre_m[at], self.gap * found.size_m[at], travels > 0.5)
+        travels = jnp.where(exists, jax.nn.sigmoid((speed_m_s - limit_m_s) / (0.2 * limit_m_s)), 0.0)
+        in_front = exists & (found.front > 0.5)
+        joins = jnp.where(in_front, jnp.where(found.life_s < self.lag_s, 1.0, travels), 0.0)
+        _, at = jax.lax.top_k(jax.lax.stop_gradient(joins), min(self.num_active, num_segments))
+        body = self._connected(found.centre_m[at], self.gap * found.size_m[at], joins[at] > 0.5)
 
         def of_tag(own: Float[Array, " segment"]) -> Float[Array, " segment"]:
             weight = own * found.area
-            going = weight[at] * travels
-            share = safe_divide(jnp.sum(going), jnp.sum(weight))
+            share = safe_divide(weight @ travels, jnp.sum(weight))
             goes = jax.nn.sigmoid((share - self.share.value) / 0.1)
-            of_body = jax.ops.segment_sum(going, body, at.shape[0])
+            of_body = jax.ops.segment_sum((weight * travels * joins)[at], body, at.shape[0])
             same = body == jnp.argmax(of_body).astype(body.dtype)
-            more = jnp.where(same, _MOST * goes * travels, 0.0)
+            more = jnp.where(same, _MOST * goes * joins[at], 0.0)
             return own.at[at].set(1.0 - (1.0 - own[at]) * (1.0 - more))
 
         return jax.vmap(of_tag)(membership)
