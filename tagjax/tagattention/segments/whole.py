@@ -106,7 +106,7 @@ def connected(
     close = (close & member[:, None] & member[None]) | jnp.eye(len(centre_m), dtype=bool)
     index = jnp.arange(len(centre_m), dtype=jnp.int32)
 
-    def spread(_: int, index: Int[Array, " segment"]) -> Int[Array, " segment"]:
+    def spread(_: Int[Array, ""], index: Int[Array, " segment"]) -> Int[Array, " segment"]:
         index = jnp.max(jnp.where(close, index[None], -1), axis=1)
         index = index[index]
         return index[index]
