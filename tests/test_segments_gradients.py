@@ -60,7 +60,8 @@ def test_gradients_through_whole_steps_reach_flow_and_depth_alone_and_stay_finit
     @jax.grad
     def gradient(flows, depths):
         def step(state, pictures):
-            state, frame = tracker.step(camera, state, *pictures, scalar(DT_S))
+            depth, flow = pictures
+            state, frame = tracker.step(camera, state, depth, flow, scalar(DT_S))
             sums = (frame.increment_m, frame.displacement_m, frame.centre_m, frame.life_s)
             return state, sum(jnp.sum(each) for each in sums)
 
