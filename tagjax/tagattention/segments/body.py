@@ -181,7 +181,8 @@ class CarryingBody(eqx.Module):
             def alternate(
                 last: tuple[Float[Array, " active"], ...], _: None
             ) -> tuple[tuple[Float[Array, " active"], ...], None]:
-                ratio = self.rigid.log_ratio(last[0] * trusted, before_m, known, centre)
+                weight = last[0]
+                ratio = self.rigid.log_ratio(weight * trusted, before_m, known, centre)
                 middle, spread_m2 = _spread(weight, centre)
                 apart = _distance_log(
                     centre, middle, self.extent.value**2 * spread_m2 + jnp.square(self.neighbour_m.value)
