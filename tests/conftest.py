@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import tempfile
 from pathlib import Path
 
 import hypothesis
@@ -37,6 +38,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    """What one worker, file or program of a run has compiled, no other compiles again."""
+    settings = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # workers find that of the process that starts them
+        folder = tempfile.TemporaryDirectory(prefix="tagjax_compiled_", ignore_cleanup_errors=True)
+        config.add_cleanup(folder.cleanup)
+        settings["JAX_COMPILATION_CACHE_DIR"] = folder.name
+    os.environ.update(settings)
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     if not config.getoption("--hypothesis-profile"):
         hypothesis.settings.load_profile("ci" if config.getoption("--ci") else "quick")
 
@@ -61,19 +71,6 @@ def _forgotten():
     """What a file's tests compiled, over a megabyte a program, goes with them: the more is kept, the slower the next."""
     yield
     jax.clear_caches()
-
-
-@pytest.fixture(scope="module")
-def compiled_once(tmp_path_factory: pytest.TempPathFactory):
-    """Programs that the tests of a file start share what they compile."""
-    settings = {
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in settings.items():
-            patch.setenv(name, value)
-        yield
 
 
 @pytest.fixture(scope="session")

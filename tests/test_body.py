@@ -20,6 +20,10 @@ def cloud(seed: int, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return rng.uniform(-0.1, 0.1, (count, 3)) + np.array([0.3, -0.1, 2.0]), rng.uniform(0.1, 1.0, count)
 
 
+fitted = jax.jit(rigid_fit)
+log_ratio = eqx.filter_jit(RigidMotion.log_ratio)
+
+
 def f32(values) -> jax.Array:
     return jnp.asarray(values, jnp.float32)
 
@@ -32,7 +36,7 @@ def test_the_fit_is_that_of_scipy(seed):
     after = turn.apply(before) + rng.normal(0, 0.2, 3) + rng.normal(0, 0.004, before.shape)
     middles = [np.average(points, axis=0, weights=weight) for points in (before, after)]
     expected = Rotation.align_vectors(after - middles[1], before - middles[0], weights=weight)[0]
-    rotation, shift_m = rigid_fit(f32(weight), f32(before), f32(after), jnp.zeros(()))
+    rotation, shift_m = fitted(f32(weight), f32(before), f32(after), jnp.zeros(()))
     np.testing.assert_allclose(rotation, expected.as_matrix(), atol=2e-4)
     np.testing.assert_allclose(shift_m, middles[1] - expected.as_matrix() @ middles[0], atol=1e-3)
 
@@ -41,7 +45,7 @@ def test_a_rigid_motion_is_found_exactly():
     before, weight = cloud(1)
     turn, shift_m = Rotation.from_euler("zyx", [0.4, -0.7, 0.2]), np.array([0.05, -0.1, 0.2])
     after = turn.apply(before) + shift_m
-    rotation, found_m = rigid_fit(f32(weight), f32(before), f32(after), jnp.zeros(()))
+    rotation, found_m = fitted(f32(weight), f32(before), f32(after), jnp.zeros(()))
     np.testing.assert_allclose(before @ np.asarray(rotation).T + np.asarray(found_m), after, atol=2e-5)
 
 
@@ -56,10 +60,10 @@ def test_where_no_axis_is_determined_no_turn_is_taken_about_it(points):
         weight[:] = 0
     after = before + 0.05
     given = f32(weight), f32(before)
-    rotation, shift_m = rigid_fit(*given, f32(after), jnp.asarray(1e-4))
+    rotation, shift_m = fitted(*given, f32(after), jnp.asarray(1e-4))
     np.testing.assert_allclose(rotation, np.eye(3), atol=1e-3)
     np.testing.assert_allclose(shift_m, 0.0 if points == "none" else 0.05, atol=3e-3)
-    gradient = jax.grad(lambda y: jnp.sum(rigid_fit(*given, y, jnp.asarray(1e-4))[0]))(f32(after))
+    gradient = jax.jit(jax.grad(lambda y: jnp.sum(rigid_fit(*given, y, jnp.asarray(1e-4))[0])))(f32(after))
     assert bool(jnp.all(jnp.isfinite(gradient)))
 
 
@@ -85,6 +89,7 @@ def test_the_gradient_of_the_log_ratio_agrees_with_finite_differences():
         rigid = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), rigid)
         known = jnp.ones((1, 12), bool)
 
+        @jax.jit
         def total(y):
             return jnp.sum(jnp.sin(rigid.log_ratio(jnp.asarray(weight), jnp.asarray(before)[None], known, y)))
 
@@ -103,7 +108,7 @@ def test_the_log_ratio_is_that_of_two_normal_distributions():
     after = before + jnp.array([[0.1, 0.0, 0.0]])
     after = after.at[5].add(jnp.array([0.0, 0.03, 0.0]))
     weight = jnp.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
-    ratio = rigid.log_ratio(weight, before[None], jnp.ones((1, 6), bool), after)
+    ratio = log_ratio(rigid, weight, before[None], jnp.ones((1, 6), bool), after)
     moved = np.array([0.1, np.hypot(0.1, 0.03)])
     inside = 0.005**2 + (0.1 * moved) ** 2 + (0.5 * 0.1**2) ** 2
     outside = inside + (0.7 * moved) ** 2
@@ -116,7 +121,7 @@ def test_a_lag_counts_only_for_segments_that_were_there():
     before = jnp.asarray(cloud(6, 5)[0], jnp.float32)
     after = before + 0.1
     known = jnp.ones((2, 5), bool).at[1, 2].set(False).at[:, 4].set(False)
-    ratio = rigid.log_ratio(jnp.ones(5), jnp.stack([before, before]), known, after)
+    ratio = log_ratio(rigid, jnp.ones(5), jnp.stack([before, before]), known, after)
     np.testing.assert_allclose(ratio, [4.0, 4.0, 2.0, 4.0, 0.0], atol=1e-5)
 
 
@@ -164,15 +169,20 @@ def scene(num_frames: int = 30, *, rate_hz: float = 30.0, turned: bool = True):
         yield jnp.asarray(at, jnp.float32), jnp.asarray(at - start, jnp.float32), jnp.asarray(time_s, jnp.float32)
 
 
+@eqx.filter_jit
+def stepped(stage: CarryingBody, *arguments) -> tuple:
+    """`step`, compiled once for all tests that have as many tags."""
+    return stage.step(*arguments)
+
+
 def found(stage: CarryingBody, evidence: jax.Array, frames) -> tuple:
     state = stage.init(evidence.shape[0], 21)
-    step = eqx.filter_jit(lambda s, *rest: stage.step(s, *rest))
     area = jnp.full(21, 16.0)
     bodies, last_s = None, jnp.zeros(())
     for centre, displacement, now_s in frames:
         life_s = jnp.full(21, now_s)
         source = jnp.full(21, -2, jnp.int32)
-        state, bodies = step(state, evidence, centre, area, life_s, displacement, source, last_s, now_s)
+        state, bodies = stepped(stage, state, evidence, centre, area, life_s, displacement, source, last_s, now_s)
         last_s = now_s
     return state, bodies
 
@@ -209,8 +219,8 @@ def test_nothing_that_moves_and_no_tag_are_defined():
     state = stage.init(1, 21)
     empty = jnp.zeros(21)
     source = jnp.full(21, -2, jnp.int32)
-    _, bodies = stage.step(
-        state, jnp.zeros((1, 21)), jnp.zeros((21, 3)), empty, empty, jnp.zeros((21, 3)), source, jnp.zeros(()), jnp.zeros(())
+    _, bodies = stepped(
+        stage, state, jnp.zeros((1, 21)), jnp.zeros((21, 3)), empty, empty, jnp.zeros((21, 3)), source, jnp.zeros(()), jnp.zeros(())
     )  # fmt: skip
     assert float(jnp.max(bodies.log_odds)) < -20
     assert float(jnp.sum(bodies.place)) == 0.0
@@ -224,8 +234,8 @@ def test_membership_moves_on_with_the_place():
     area, source = jnp.full(21, 16.0), jnp.full(21, -2, jnp.int32)
     frames = list(scene(32))
     centre, displacement, now_s = frames[30]
-    state, bodies = stage.step(
-        state, jnp.zeros((1, 21)).at[0, 17].set(60.0), centre, area, jnp.full(21, now_s), displacement, source,
+    state, bodies = stepped(
+        stage, state, jnp.zeros((1, 21)).at[0, 17].set(60.0), centre, area, jnp.full(21, now_s), displacement, source,
         frames[29][2], now_s,
     )  # fmt: skip
     member = np.asarray(bodies.log_odds)[0] > 0
@@ -244,8 +254,8 @@ def test_a_newborn_segment_inherits_the_membership_of_its_source():
     life_s = jnp.full(21, now_s).at[18:].set(0.0)
     displacement = displacement.at[18:].set(0.0)
     area = jnp.full(21, 16.0)
-    after, bodies = stage.step(
-        state, evidence, centre, area, life_s, displacement, source, frames[29][2], now_s
+    after, bodies = stepped(
+        stage, state, evidence, centre, area, life_s, displacement, source, frames[29][2], now_s
     )  # fmt: skip
     assert float(bodies.log_odds[0, 20]) > 0
     assert float(after.membership[0, 20]) > 1.0
@@ -254,22 +264,25 @@ def test_a_newborn_segment_inherits_the_membership_of_its_source():
 
 def test_gradients_reach_evidence_motion_and_parameters():
     stage = CarryingBody()
-    frames = list(scene(12))
+    frames = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scene(12))
     area, source = jnp.full(21, 16.0), jnp.full(21, -2, jnp.int32)
 
-    def total(stage, evidence, scale):
-        state, last_s, value = stage.init(1, 21), jnp.zeros(()), 0.0
-        for centre, displacement, now_s in frames:
+    def total(learned):
+        stage, evidence, scale = learned
+
+        def step(carry, frame):
+            state, last_s, _ = carry
+            centre, displacement, now_s = frame
             state, bodies = stage.step(
                 state, evidence, centre, area, jnp.full(21, now_s), scale * displacement, source, last_s, now_s
             )
-            value, last_s = jnp.sum(jax.nn.sigmoid(bodies.log_odds)), now_s
+            return (state, now_s, jnp.sum(jax.nn.sigmoid(bodies.log_odds))), None
+
+        (_, _, value), _ = jax.lax.scan(step, (stage.init(1, 21), jnp.zeros(()), jnp.zeros(())), frames)
         return value
 
     evidence = jnp.zeros((1, 21)).at[0, 1:9].set(20.0).at[0, 9:15].set(12.0)
-    by_stage, by_rest = eqx.filter_grad(total)(stage, evidence, jnp.ones(())), jax.grad(total, (1, 2))(
-        stage, evidence, jnp.ones(())
-    )  # fmt: skip
+    by_stage, *by_rest = eqx.filter_jit(eqx.filter_grad(total))((stage, evidence, jnp.ones(())))
     leaves = [*jax.tree.leaves(eqx.filter(by_stage, eqx.is_array)), *by_rest]
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
     assert float(jnp.abs(by_rest[1])) > 0

@@ -16,7 +16,7 @@ import synthetic_clips as synthetic
 from test_resume import _kept, _steps_logged, _train, _train_flow
 
 ROOT = Path(__file__).parents[1]
-pytestmark = [pytest.mark.ci, pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("compiled_once")]
+pytestmark = [pytest.mark.ci, pytest.mark.filterwarnings("ignore")]
 
 
 def _free_port() -> int:

@@ -219,7 +219,6 @@ def test_training_that_was_stopped_raises_after_its_checkpoint(
 
 
 @pytest.mark.ci
-@pytest.mark.usefixtures("compiled_once")
 @pytest.mark.filterwarnings("ignore")  # Orbax guesses how arrays are placed on devices
 def test_a_run_that_sigterm_stopped_does_not_start_the_next_command_and_resumes(scene: str, tmp_path: Path) -> None:
     straight, broken = tmp_path / "straight", tmp_path / "broken"
@@ -237,7 +236,6 @@ def test_a_run_that_sigterm_stopped_does_not_start_the_next_command_and_resumes(
 
 
 @pytest.mark.ci
-@pytest.mark.usefixtures("compiled_once")
 @both_signals
 def test_training_that_is_interrupted_while_its_workers_import_ends_in_one_line(
     number: signal.Signals, scene: str, tmp_path: Path
@@ -372,7 +370,6 @@ def test_pictures_and_figures_that_do_not_fit_leave_the_earlier_ones(tmp_path: P
 
 
 @pytest.mark.ci
-@pytest.mark.usefixtures("compiled_once")
 @pytest.mark.filterwarnings("ignore")
 def test_a_run_on_a_full_disk_ends_in_one_line_and_resumes(scene: str, tmp_path: Path) -> None:
     straight, broken = tmp_path / "straight", tmp_path / "broken"

@@ -58,7 +58,8 @@ def test_its_gradient_is_the_difference_quotient_and_finite_where_nothing_agrees
 
 @pytest.fixture(scope="module")
 def pair():
-    drawn = flow_pair(FlowPairSettings(height=80, width=96), key=jax.random.key(3))
+    settings = FlowPairSettings(height=80, width=96)
+    drawn = jax.jit(lambda key: flow_pair(settings, key=key))(jax.random.key(3))
     pictures = [np.rint(255 * np.asarray(each)).astype(np.uint8) for each in (drawn.first, drawn.second)]
     return pictures, np.asarray(drawn.forward_px), np.asarray(drawn.occluded_first)
 

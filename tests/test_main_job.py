@@ -97,7 +97,7 @@ def test_train_then_evaluate_the_run(recordings: list[str], tmp_path: Path) -> N
             "recordings": recordings[1:],
             "frames": [0, 9],
             "baselines": {},
-            "clips": {"stride": 8},
+            "clips": {"flow": "zero"},
             "scores": {"from_s": 0.0},
             "progress": False,
         },

@@ -24,7 +24,6 @@ from tagjax.training.clip_dataset import clip_dataset
 
 ROOT = Path(__file__).parents[1]
 NUM_STEPS = 16
-pytestmark = pytest.mark.usefixtures("compiled_once")
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,8 @@ def test_compiled_and_eager_steps_agree() -> None:
     step = eqx.filter_jit(tracker.step)
     for depth, flow in frames:
         given = jnp.asarray(depth), jnp.asarray(flow), scalar(DT_S)
-        eager, one = tracker.step(camera, eager, *given)
+        with jax.disable_jit():  # loops and branches as well: eager ones are compiled anew at each step
+            eager, one = tracker.step(camera, eager, *given)
         compiled, two = step(camera, compiled, *given)
         np.testing.assert_array_equal(one.labels, two.labels)
         np.testing.assert_array_equal(one.source, two.source)
@@ -58,12 +59,13 @@ def test_gradients_through_whole_steps_reach_flow_and_depth_alone_and_stay_finit
     @eqx.filter_jit
     @jax.grad
     def gradient(flows, depths):
-        state, total = tracker.init(camera), jnp.zeros(())
-        for t in range(3):
-            state, frame = tracker.step(camera, state, depths[t], flows[t], scalar(DT_S))
-            total = total + jnp.sum(frame.increment_m)
-            total = total + jnp.sum(frame.displacement_m) + jnp.sum(frame.centre_m) + jnp.sum(frame.life_s)
-        return total
+        def step(state, pictures):
+            depth, flow = pictures
+            state, frame = tracker.step(camera, state, depth, flow, scalar(DT_S))
+            sums = (frame.increment_m, frame.displacement_m, frame.centre_m, frame.life_s)
+            return state, sum(jnp.sum(each) for each in sums)
+
+        return jnp.sum(jax.lax.scan(step, tracker.init(camera), (depths, flows))[1])
 
     depths, flows = (jnp.asarray(np.stack(each)) for each in zip(*frames, strict=True))
     found = np.asarray(gradient(flows, depths))

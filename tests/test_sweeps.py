@@ -28,7 +28,6 @@ from tagjax.tagattention.tracer_settings import make_tracer, with_values
 from tagjax.training.logging import Logger, LoggerSettings
 
 ROOT = Path(__file__).parents[1]
-pytestmark = pytest.mark.usefixtures("compiled_once")
 
 
 @pytest.fixture(scope="module")

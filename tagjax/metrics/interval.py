@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import stats
+import scipy  # its submodules are imported at their first use: `stats` alone takes most of a second
 
 from .mean import MaskedMean
 
@@ -39,7 +39,7 @@ def ratio_estimate(totals: Float[np.ndarray, " recording"], counts: Int[np.ndarr
         return Estimate(None, None, None, 0.0, 0, 0)
     value, low, high = float(total.sum() / count.sum()), None, None
     if len(count) > 1:
-        drawn = stats.bootstrap(
+        drawn = scipy.stats.bootstrap(
             (total, count),
             lambda total, count, axis=-1: total.sum(axis=axis) / count.sum(axis=axis),
             n_resamples=NUM_RESAMPLES,

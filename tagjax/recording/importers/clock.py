@@ -12,7 +12,7 @@ import dataclasses
 import datetime as dt
 
 import numpy as np
-import scipy.stats
+import scipy  # `scipy.stats` is imported at its first use: it takes most of a second
 
 from ...core.errors import RecordingError
 from ..recording import ClockAudit, ClockPiece

@@ -11,7 +11,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Positive
 from ...core.numerics import safe_divide, safe_norm, squared_distance
@@ -152,10 +152,12 @@ class CarryingBody(eqx.Module):
         close = squared_distance(centre, centre) < jnp.square(self.neighbour_m.value)
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
-        lagged = [past.since(lag, displacement_m, life_s, now_s) for lag in self.rigid.lags_s]
-        before_m = jnp.stack([centre - moved[active] for moved, _ in lagged])
-        long_enough = [elapsed >= 0.8 * lag for (_, elapsed), lag in zip(lagged, self.rigid.lags_s, strict=True)]
-        known = jnp.stack([enough[active] & there for enough in long_enough])
+
+        def before(lag_s: Float[Array, ""]) -> tuple[Float[Array, "active 3"], Bool[Array, " active"]]:
+            moved_m, elapsed_s = past.since(lag_s, displacement_m, life_s, now_s)
+            return centre - moved_m[active], (elapsed_s[active] >= 0.8 * lag_s) & there
+
+        before_m, known = jax.vmap(before)(jnp.array(self.rigid.lags_s, centre.dtype))
         width = 0.3 * self.moving_m_s.value
         moving = jax.nn.log_sigmoid((fastest_m_s[active] - self.moving_m_s.value) / width)
 
@@ -175,9 +177,11 @@ class CarryingBody(eqx.Module):
             # A memory that the place of the tag disagrees with is of another body.
             memory, *later = (jnp.where(jnp.sum(start * one) > 0, one, 0.0) for one in memories)
             remembered = sum(later, memory)
-            weight = start
-            log_odds = ratio = jnp.zeros_like(own)
-            for _ in range(self.num_rounds):
+
+            def alternate(
+                last: tuple[Float[Array, " active"], ...], _: None
+            ) -> tuple[tuple[Float[Array, " active"], ...], None]:
+                weight = last[0]
                 ratio = self.rigid.log_ratio(weight * trusted, before_m, known, centre)
                 middle, spread_m2 = _spread(weight, centre)
                 apart = _distance_log(
@@ -186,7 +190,12 @@ class CarryingBody(eqx.Module):
                 alone = ratio + self.prior + against + remembered + apart
                 log_odds = alone + self.neighbours.value * (2.0 * (near @ jax.nn.sigmoid(alone)) - 1.0)
                 weight = size * jax.nn.sigmoid(log_odds)
-                weight = weight + 0.2 * jnp.sum(weight) * start  # the place itself always counts
+                # The place itself always counts.
+                return (weight + 0.2 * jnp.sum(weight) * start, log_odds, ratio), None
+
+            # A loop, not the rounds one after another: it is compiled once.
+            begin = start, jnp.zeros_like(own), jnp.zeros_like(own)
+            (_, log_odds, ratio), _ = jax.lax.scan(alternate, begin, None, length=self.num_rounds)
             after = keep * memory + (1.0 - keep) * jnp.clip(ratio + against, -4.0, 4.0)
             return log_odds, place, jnp.clip(after, -4.0, 4.0)
 

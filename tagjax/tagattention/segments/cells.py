@@ -95,10 +95,8 @@ def _most_common(
     label: Int[Array, "row column member"], weight: Int[Array, "row column member"]
 ) -> tuple[Int[Array, "row column"], Int[Array, "row column"]]:
     """The label with the largest summed weight of each cell, of equals the smallest; and that weight."""
-    votes = jnp.zeros_like(weight)
-    for other in range(label.shape[-1]):  # pairs of members, one by one: no array of all pairs
-        equal = label == label[..., other : other + 1]
-        votes = votes + jnp.where(equal, weight[..., other : other + 1], 0)
+    equal = label[..., :, None] == label[..., None, :]  # within the sum XLA makes no array of all pairs
+    votes = jnp.sum(jnp.where(equal, weight[..., None, :], 0), axis=-1, dtype=weight.dtype)
     votes = jnp.where(weight > 0, votes, 0)
     most = jnp.max(votes, axis=-1)
     largest = jnp.iinfo(jnp.int32).max

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ...core.numerics import safe_norm
 from ...core.parameters import check_positive, check_positive_integers
@@ -187,10 +187,14 @@ class Segmenter(eqx.Module):
             foreground = foreground & (given < 0)
             kept = jnp.where((given >= 0) | (kept >= first_given(self.num_segments)), NO_LABEL, kept)
             may_be_free = may_be_free & (slots < first_given(self.num_segments))
-        labels = jax.lax.cond(
-            first,
-            lambda: self._started(feature, foreground),
-            lambda: self._reassigned(kept, feature, side, foreground),
+        # The first frame's blocks are reassigned some rounds, later labels once: one loop is compiled for both.
+        labels, reassigned_at = self._started(height, width, foreground)
+        labels, reassigned_at = jnp.where(first, labels, kept), jnp.where(first, reassigned_at, side)
+        labels = jax.lax.fori_loop(
+            0,
+            jnp.where(first, _START_ROUNDS, 1),
+            lambda _, now: self._reassigned(now, feature, reassigned_at, foreground),
+            labels,
         )
         one = jnp.ones_like(depth_m)
         (number,) = slot_sums([one], labels > 0, labels, self.num_segments)
@@ -256,17 +260,14 @@ class Segmenter(eqx.Module):
             | (background.matched & background.ripe & background.still & ~moved)
         )
 
-    def _started(self, feature: Feature, foreground: Bool[Array, "height width"]) -> Int[Array, "height width"]:
-        """The first frame's segments: blocks, reassigned some rounds."""
-        height, width = foreground.shape
+    def _started(
+        self, height: int, width: int, foreground: Bool[Array, "height width"]
+    ) -> tuple[Int[Array, "height width"], Float[Array, ""]]:
+        """The first frame's labels before they are reassigned, blocks, and their side."""
         side_px = self.start_side(height, width)
         row, column = jnp.arange(height, dtype=jnp.int32) // side_px, jnp.arange(width, dtype=jnp.int32) // side_px
         block = row[:, None] * -(-width // side_px) + column[None] + 1
-        labels = jnp.where(foreground, block, NO_LABEL)
-        side = jnp.full(foreground.shape, side_px, feature[0].dtype)
-        return jax.lax.fori_loop(
-            0, _START_ROUNDS, lambda _, now: self._reassigned(now, feature, side, foreground), labels
-        )
+        return jnp.where(foreground, block, NO_LABEL), jnp.asarray(side_px, float)
 
     def _reassigned(
         self,
@@ -289,11 +290,16 @@ class Segmenter(eqx.Module):
             for right in (0, -1, 1):
                 y, x = row + down * step, column + right * step
                 inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-                other = jnp.where(inside, flat[jnp.where(inside, y * width + x, 0)], NO_LABEL)
+                other = jnp.where(inside, _at(flat, jnp.where(inside, y * width + x, 0)), NO_LABEL)
                 slot = jnp.maximum(other, 0)
-                apart = [jnp.square(own - table[slot]) for own, table in zip(feature, centre, strict=True)]
+                apart = [jnp.square(own - _at(table, slot)) for own, table in zip(feature, centre, strict=True)]
                 away = (apart[0] + apart[1] + apart[2]) / jnp.square(side_px)
                 away = jnp.where(other == labels, away - _STAY, away)
                 better = (other > 0) & foreground & (away < best)
                 best, found = jnp.where(better, away, best), jnp.where(better, other, found)
         return found
+
+
+def _at(table: Shaped[Array, " entry"], index: Int[Array, "height width"]) -> Shaped[Array, "height width"]:
+    """The entries at indices that lie within the table, without the operations for those that do not."""
+    return table.at[index].get(mode="promise_in_bounds")

@@ -57,7 +57,7 @@ class PastMotion(eqx.Module):
 
     def since(
         self,
-        lag_s: float,
+        lag_s: float | Float[Array, ""],
         displacement_m: Float[Array, "segment 3"],
         life_s: Float[Array, " segment"],
         now_s: Float[Array, ""],

@@ -110,8 +110,10 @@ def connected(
     close = squared_distance(centre_m, centre_m) < jnp.square(0.5 * (reach_m[:, None] + reach_m[None]))
     close = (close & member[:, None] & member[None]) | jnp.eye(len(centre_m), dtype=bool)
     index = jnp.arange(len(centre_m), dtype=jnp.int32)
-    for _ in range(_ROUNDS):
+
+    def spread(_: Int[Array, ""], index: Int[Array, " segment"]) -> Int[Array, " segment"]:
         index = jnp.max(jnp.where(close, index[None], -1), axis=1)
         index = index[index]
-        index = index[index]
-    return index
+        return index[index]
+
+    return jax.lax.fori_loop(0, _ROUNDS, spread, index)
