@@ -150,6 +150,9 @@ def test_a_newborn_segment_has_no_past_of_the_slot_before():
     assert float(elapsed_s[1]) == pytest.approx(1 / 30)
 
 
+SIZE_M = jnp.full(21, 0.06)
+
+
 def scene(num_frames: int = 30, *, rate_hz: float = 30.0, turned: bool = True):
     """Segments of an object (1 to 8), of an arm (9 to 14) that turns about its far end, and of another object (15 to 20).
 
@@ -182,7 +185,9 @@ def found(stage: CarryingBody, evidence: jax.Array, frames) -> tuple:
     for centre, displacement, now_s in frames:
         life_s = jnp.full(21, now_s)
         source = jnp.full(21, -2, jnp.int32)
-        state, bodies = stepped(stage, state, evidence, centre, area, life_s, displacement, source, last_s, now_s)
+        state, bodies = stepped(
+            stage, state, evidence, centre, area, SIZE_M, life_s, displacement, source, last_s, now_s
+        )
         last_s = now_s
     return state, bodies
 
@@ -220,10 +225,28 @@ def test_nothing_that_moves_and_no_tag_are_defined():
     empty = jnp.zeros(21)
     source = jnp.full(21, -2, jnp.int32)
     _, bodies = stepped(
-        stage, state, jnp.zeros((1, 21)), jnp.zeros((21, 3)), empty, empty, jnp.zeros((21, 3)), source, jnp.zeros(()), jnp.zeros(())
+        stage, state, jnp.zeros((1, 21)), jnp.zeros((21, 3)), empty, empty, empty, jnp.zeros((21, 3)), source, jnp.zeros(()), jnp.zeros(())
     )  # fmt: skip
     assert float(jnp.max(bodies.log_odds)) < -20
     assert float(jnp.sum(bodies.place)) == 0.0
+
+
+@pytest.mark.parametrize(("size_m", "belongs"), [(0.05, False), (0.15, True)])
+def test_what_moves_alike_belongs_to_the_body_where_it_is_connected(size_m: float, belongs: bool):
+    stage, evidence = CarryingBody(), jnp.zeros((1, 21)).at[0, 4].set(60.0)
+    state, bodies, last_s, source = stage.init(1, 21), None, jnp.zeros(()), jnp.full(21, -2, jnp.int32)
+    for centre, displacement, now_s in scene():
+        centre = centre.at[15:].set(centre[1:7].at[:, 0].add(0.3))
+        displacement = displacement.at[15:].set(displacement[1:7])
+        state, bodies = stepped(
+            stage, state, evidence, centre, jnp.full(21, 16.0), jnp.full(21, size_m), jnp.full(21, now_s), displacement,
+            source, last_s, now_s,
+        )  # fmt: skip
+        last_s = now_s
+    assert bodies is not None
+    member = np.asarray(bodies.log_odds)[0] > 0
+    assert member[1:9].all()
+    assert member[15:].all() == member[15:].any() == belongs
 
 
 def test_membership_moves_on_with_the_place():
@@ -235,7 +258,7 @@ def test_membership_moves_on_with_the_place():
     frames = list(scene(32))
     centre, displacement, now_s = frames[30]
     state, bodies = stepped(
-        stage, state, jnp.zeros((1, 21)).at[0, 17].set(60.0), centre, area, jnp.full(21, now_s), displacement, source,
+        stage, state, jnp.zeros((1, 21)).at[0, 17].set(60.0), centre, area, SIZE_M, jnp.full(21, now_s), displacement, source,
         frames[29][2], now_s,
     )  # fmt: skip
     member = np.asarray(bodies.log_odds)[0] > 0
@@ -255,7 +278,7 @@ def test_a_newborn_segment_inherits_the_membership_of_its_source():
     displacement = displacement.at[18:].set(0.0)
     area = jnp.full(21, 16.0)
     after, bodies = stepped(
-        stage, state, evidence, centre, area, life_s, displacement, source, frames[29][2], now_s
+        stage, state, evidence, centre, area, SIZE_M, life_s, displacement, source, frames[29][2], now_s
     )  # fmt: skip
     assert float(bodies.log_odds[0, 20]) > 0
     assert float(after.membership[0, 20]) > 1.0
@@ -274,7 +297,7 @@ def test_gradients_reach_evidence_motion_and_parameters():
             state, last_s, _ = carry
             centre, displacement, now_s = frame
             state, bodies = stage.step(
-                state, evidence, centre, area, jnp.full(21, now_s), scale * displacement, source, last_s, now_s
+                state, evidence, centre, area, SIZE_M, jnp.full(21, now_s), scale * displacement, source, last_s, now_s
             )
             return (state, now_s, jnp.sum(jax.nn.sigmoid(bodies.log_odds))), None
 

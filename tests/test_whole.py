@@ -1,4 +1,4 @@
-"""Bodies that travel are whole: connected components against SciPy, closed forms, gradients."""
+"""Bodies that travel are whole: closed forms, gradients."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.sparse.csgraph import connected_components
 from segments_scenes import segment_frame
 
 from tagjax.tagattention.segments import WholeBody
-from tagjax.tagattention.segments.whole import connected
 
 ELAPSED = jnp.full(9, 0.67)
 
@@ -34,7 +32,7 @@ def trunk(probability: float = 0.9):
 
 def test_all_that_is_connected_and_travels_belongs_to_a_body_that_travels():
     found, moved = person()
-    after = np.asarray(WholeBody(gap=3.0).completed(trunk(), found, moved, ELAPSED))[0]
+    after = np.asarray(WholeBody().completed(trunk(), found, moved, ELAPSED))[0]
     assert (after[1:7] > 0.9).all()
     np.testing.assert_allclose(after[[0, 7, 8]], 0.01, atol=5e-3)
 
@@ -51,7 +49,7 @@ def test_a_body_that_does_not_travel_stays_as_it_is():
 def test_a_gap_ends_the_body():
     found, moved = person()
     found = eqx.tree_at(lambda one: one.centre_m, found, found.centre_m.at[5:7, 1].add(0.3))
-    after = np.asarray(WholeBody(gap=3.0).completed(trunk(), found, moved, ELAPSED))[0]
+    after = np.asarray(WholeBody().completed(trunk(), found, moved, ELAPSED))[0]
     assert (after[1:5] > 0.9).all()
     assert (after[5:7] < 0.05).all()
 
@@ -70,25 +68,6 @@ def test_what_is_not_in_front_of_the_surface_at_rest_is_a_shadow():
     after = np.asarray(WholeBody().completed(trunk(), shadow, moved, ELAPSED))[0]
     assert (after[1:5] > 0.9).all()
     assert (after[5:7] < 0.05).all()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_components_are_those_of_scipy(seed):
-    rng = np.random.default_rng(seed)
-    centre = rng.uniform(0, 1, (150, 3)).astype(np.float32)
-    reach = rng.uniform(0.05, 0.2, 150).astype(np.float32)
-    member = rng.random(150) < 0.8
-    apart = np.linalg.norm(centre[:, None] - centre[None], axis=-1)
-    close = (apart < 0.5 * (reach[:, None] + reach[None])) & member[:, None] & member[None]
-    _, expected = connected_components(close, directed=False)
-    found = np.asarray(connected(jnp.asarray(centre), jnp.asarray(reach), jnp.asarray(member)))
-    np.testing.assert_array_equal(found[:, None] == found[None], expected[:, None] == expected[None])
-
-
-def test_a_long_chain_is_one_component():
-    centre = jnp.zeros((100, 3)).at[:, 0].set(jnp.arange(100.0))
-    index = connected(centre, jnp.full(100, 1.5), jnp.ones(100, bool))
-    np.testing.assert_array_equal(index, 99)
 
 
 def test_the_gradient_of_the_speed_agrees_with_finite_differences_and_is_finite_without_motion():

@@ -7,9 +7,8 @@ from jaxtyping import Bool, Float
 
 from ...tagattention.segments import body as original
 from ...tagattention.segments import rigid
+from .connection import reached, touching
 from .travel import Past, Segments, norm, squared_distance, top
-
-_NOT_LOOKED_AT = -30.0
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
@@ -117,7 +116,7 @@ class Body:
         active = top(np.where(found.exists, rank, -np.inf), s.num_active)
         gone = active[~found.exists[active]]
         active = active[found.exists[active]]
-        out = np.full(self.membership.shape, _NOT_LOOKED_AT, np.float32)
+        out = np.full(self.membership.shape, original._APART, np.float32)
         place = np.zeros_like(out)
         memory = self.membership[:, active]
         self.membership *= keep
@@ -129,7 +128,7 @@ class Body:
                 elapsed[active] >= np.float32(0.8 * lag) for (_, elapsed), lag in zip(lagged, self.lags_s, strict=True)
             ]
             out[:, active], place[:, active], self.membership[:, active] = self._bodies(
-                evidence[:, active], memory, found.centre_m[active], found.area[active], moved, np.stack(enough), keep,
+                evidence[:, active], memory, found.centre_m[active], found.area[active], found.size_m[active], moved, np.stack(enough), keep,
                 self.fastest_m_s[active],
             )  # fmt: skip
         return out, place
@@ -140,6 +139,7 @@ class Body:
         memory: Float[np.ndarray, "tag active"],
         centre: Float[np.ndarray, "active 3"],
         size: Float[np.ndarray, " active"],
+        size_m: Float[np.ndarray, " active"],
         moved: Float[np.ndarray, "lag active 3"],
         known: Bool[np.ndarray, "lag active"],
         keep: np.float32,
@@ -180,5 +180,7 @@ class Body:
             log_odds = alone + v["neighbours"] * (2 * (sigmoid(alone) @ near) - 1)
             weight = size * sigmoid(log_odds)
             weight = weight + np.float32(0.2) * weight.sum(axis=1, keepdims=True) * start
+        member = log_odds > 0
+        log_odds[member & ~reached(touching(centre, size_m), member, peak)] = original._APART
         after = keep * memory + (1 - keep) * np.clip(ratio + against, -4, 4)
         return log_odds, place, np.clip(after, -4, 4)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from ...tagattention.segments import hidden, whole
 from .body import sigmoid
+from .connection import connected, touching
 from .travel import Segments, norm, squared_distance, top
 
 
@@ -16,7 +17,6 @@ class Whole:
     def __init__(self, settings: whole.WholeBody) -> None:
         self.lag_s, self.num_active = settings.lag_s, settings.num_active
         self.travel_m_s, self.share = (np.float32(one.value) for one in (settings.travel_m_s, settings.share))
-        self.gap = np.float32(settings.gap)
 
     def complete(
         self, membership: Float[np.ndarray, "tag segment"], found: Segments, moved_m: np.ndarray, elapsed_s: np.ndarray
@@ -32,7 +32,7 @@ class Whole:
         at = at[found.exists[at]]
         if not len(at):
             return
-        body = connected(found.centre_m[at], self.gap * found.size_m[at], joins[at] > 0.5)
+        body = connected(touching(found.centre_m[at], found.size_m[at]), joins[at] > 0.5)
         weight = membership * found.area
         total = weight.sum(axis=1)
         goes = sigmoid(((weight @ travels) / np.where(total != 0, total, 1) - self.share) / np.float32(0.1))
@@ -41,27 +41,6 @@ class Whole:
         same = body[None] == np.argmax(of_body, axis=1)[:, None]
         more = np.where(same, np.float32(whole._MOST) * goes[:, None] * joins[at][None], zero)
         membership[:, at] = 1 - (1 - membership[:, at]) * (1 - more)
-
-
-def connected(
-    centre_m: Float[np.ndarray, "active 3"], reach_m: Float[np.ndarray, " active"], member: Bool[np.ndarray, " active"]
-) -> Int[np.ndarray, " active"]:
-    """The largest index in each one's component; see `whole.connected`; chains have the same greatest length."""
-    index = np.arange(len(centre_m))
-    at = np.flatnonzero(member)
-    if not len(at):
-        return index
-    limit = np.float32(0.5) * (reach_m[at][:, None] + reach_m[at][None])
-    close = squared_distance(centre_m[at], centre_m[at]) < np.square(limit)
-    close[np.diag_indices(len(at))] = True
-    own = np.arange(len(at))
-    for _ in range(whole._ROUNDS):
-        last, own = own, np.where(close, own[None], -1).max(axis=1)
-        own = own[own][own[own]]
-        if np.array_equal(last, own):
-            break
-    index[at] = at[own]
-    return index
 
 
 class Hidden:

@@ -3,7 +3,7 @@
 Two questions are kept apart. Which body carries the tag is a question to the reads: the place of the tag is distributed
 over segments as exp(evidence / temperature). What belongs to that body is a question to the camera: segments whose motion
 in space is that of the place (`RigidMotion`), and whose neighbours belong to it. The two alternate for a few rounds, as in
-expectation maximisation.
+expectation maximisation. Then what is not connected with the place is left out.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Positive
 from ...core.numerics import safe_divide, safe_norm, squared_distance
+from .connection import reached, touching
 from .past_motion import PastMotion
 from .rigid import RigidMotion
 
 _TINY = 1e-9
+_APART = -30.0  # log odds of what is not looked at, or not connected with the place
 
 
 class BodyState(eqx.Module):
@@ -111,6 +113,7 @@ class CarryingBody(eqx.Module):
         evidence: Float[Array, "tag segment"],
         centre_m: Float[Array, "segment 3"],
         area: Float[Array, " segment"],
+        size_m: Float[Array, " segment"],
         life_s: Float[Array, " segment"],
         displacement_m: Float[Array, "segment 3"],
         newborn_source: Int[Array, " segment"],
@@ -121,7 +124,7 @@ class CarryingBody(eqx.Module):
         """The state after the frame at `now_s`, and each tag's body.
 
         `evidence` is that of the reads for a tag at a segment against one at rest, nats; `area` in pixels, 0 for a slot
-        without segment; slot 0 is the static background. `newborn_source` is -2 for a segment that is not newborn, else
+        without segment; `size_m` as in `SegmentFrame`; slot 0 is the static background. `newborn_source` is -2 for a segment that is not newborn, else
         the slot it comes from, or -1. Displacement and life of a newborn segment go on from those of the slot it comes from,
         as those of `Travel` do. What is remembered of `later` frames counts as what is remembered of earlier ones does, and is
         not carried on.
@@ -150,6 +153,7 @@ class CarryingBody(eqx.Module):
         centre, size = centre_m[active], jnp.where(there, area[active], 0.0)
 
         close = squared_distance(centre, centre) < jnp.square(self.neighbour_m.value)
+        touch = touching(centre, size_m[active])
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
 
@@ -196,6 +200,9 @@ class CarryingBody(eqx.Module):
             # A loop, not the rounds one after another: it is compiled once.
             begin = start, jnp.zeros_like(own), jnp.zeros_like(own)
             (_, log_odds, ratio), _ = jax.lax.scan(alternate, begin, None, length=self.num_rounds)
+            # A body is one connected thing. Whatever else moves as it does belongs to something else.
+            member = log_odds > 0
+            log_odds = jnp.where(member & ~reached(touch, member, peak), _APART, log_odds)
             after = keep * memory + (1.0 - keep) * jnp.clip(ratio + against, -4.0, 4.0)
             return log_odds, place, jnp.clip(after, -4.0, 4.0)
 
@@ -204,7 +211,7 @@ class CarryingBody(eqx.Module):
         # Segments that are not looked at forget as well.
         membership = (keep * membership).at[:, active].set(jnp.where(there[None], remembered, 0.0))
         return BodyState(past, membership, own_m_s), Bodies(
-            log_odds=jnp.full(shape, -30.0).at[:, active].set(jnp.where(there[None], log_odds, -30.0)),
+            log_odds=jnp.full(shape, _APART).at[:, active].set(jnp.where(there[None], log_odds, _APART)),
             place=jnp.zeros(shape).at[:, active].set(jnp.where(there[None], place, 0.0)),
             speed_m_s=speed_m_s,
         )

@@ -313,7 +313,7 @@ class TagAttention(AbstractSmoother):
             return None, membership, membership * found.area[None]
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
         state, bodies = self.body.step(
-            state, evidence, found.centre_m, found.area, found.life_s, found.displacement_m, found.source, since_s, now_s,
+            state, evidence, found.centre_m, found.area, found.size_m, found.life_s, found.displacement_m, found.source, since_s, now_s,
             later,
         )  # fmt: skip
         membership = jax.nn.sigmoid(bodies.log_odds)

@@ -5,8 +5,6 @@ on, while the arm of someone who stays in place goes to and fro: over two thirds
 So where most of a tag's body travels, the segments that travel too, and are connected with it by segments that travel,
 belong to it. Segments on legs hardly live for so long: those that are younger than that belong as well. What is not in
 front of the surface that has been seen at rest there is a shadow on it, and no part of a body.
-
-Two segments are connected where their middles are not further apart than `gap` times their mean size.
 """
 
 from __future__ import annotations
@@ -17,11 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Fraction, Positive
-from ...core.numerics import safe_divide, safe_norm, squared_distance
+from ...core.numerics import safe_divide, safe_norm
 from ...core.parameters import check_positive
+from .connection import connected, touching
 from .step import SegmentFrame
 
-_ROUNDS = 6
 _FEW = 256  # segments that may belong to bodies that travel; in a crowd there are more
 _MOST = 0.95  # probability that a connected segment belongs to the body
 
@@ -31,7 +29,6 @@ class WholeBody(eqx.Module):
 
     travel_m_s: Positive  # net displacement over `lag_s`, above which a segment travels
     share: Fraction  # a body travels where so much of it does
-    gap: float = eqx.field(static=True)  # of the middles of segments that are connected, in their mean size
     lag_s: float = eqx.field(static=True)
     num_active: int = eqx.field(static=True)  # segments that are looked at: those that most likely travel
 
@@ -39,17 +36,16 @@ class WholeBody(eqx.Module):
         self,
         *,
         travel_m_s: float = 0.2,
-        gap: float = 3.0,
         share: float = 0.5,
         lag_s: float = 0.67,
         num_active: int = 1024,
     ) -> None:
         """Raises `ValueError` for a value that is not positive, or a share that is not between 0 and 1."""
-        check_positive(lag_s=lag_s, gap=gap)
+        check_positive(lag_s=lag_s)
         if num_active < 1:
             raise ValueError(f"num_active is {num_active}; expected at least 1.")
         self.travel_m_s, self.share = Positive(travel_m_s), Fraction(share)
-        self.gap, self.lag_s, self.num_active = float(gap), float(lag_s), num_active
+        self.lag_s, self.num_active = float(lag_s), num_active
 
     def completed(
         self,
@@ -71,7 +67,7 @@ class WholeBody(eqx.Module):
         in_front = exists & (found.front > 0.5)
         joins = jnp.where(in_front, jnp.where(found.life_s < self.lag_s, 1.0, travels), 0.0)
         _, at = jax.lax.top_k(jax.lax.stop_gradient(joins), min(self.num_active, num_segments))
-        body = self._connected(found.centre_m[at], self.gap * found.size_m[at], joins[at] > 0.5)
+        body = self._connected(found.centre_m[at], found.size_m[at], joins[at] > 0.5)
 
         def of_tag(own: Float[Array, " segment"]) -> Float[Array, " segment"]:
             weight = own * found.area
@@ -85,35 +81,15 @@ class WholeBody(eqx.Module):
         return jax.vmap(of_tag)(membership)
 
     def _connected(
-        self, centre_m: Float[Array, "active 3"], reach_m: Float[Array, " active"], member: Bool[Array, " active"]
+        self, centre_m: Float[Array, "active 3"], size_m: Float[Array, " active"], member: Bool[Array, " active"]
     ) -> Int[Array, " active"]:
         """`connected`, which costs the square of the number of segments, of the first few alone where these are all members."""
         num_active, few = len(centre_m), min(_FEW, len(centre_m))
 
         def of_few(_: None) -> Int[Array, " active"]:
             index = jnp.arange(num_active, dtype=jnp.int32)
-            return index.at[:few].set(connected(centre_m[:few], reach_m[:few], member[:few]))
+            return index.at[:few].set(connected(touching(centre_m[:few], size_m[:few]), member[:few]))
 
         return jax.lax.cond(
-            jnp.sum(member) <= few, of_few, lambda _: connected(centre_m, reach_m, member), operand=None
+            jnp.sum(member) <= few, of_few, lambda _: connected(touching(centre_m, size_m), member), operand=None
         )
-
-
-def connected(
-    centre_m: Float[Array, "segment 3"], reach_m: Float[Array, " segment"], member: Bool[Array, " segment"]
-) -> Int[Array, " segment"]:
-    """The largest index of a segment in each one's connected component; a segment that is no member is one by itself.
-
-    Members are connected where their centres are closer than the mean of their reaches. Components whose diameter
-    exceeds what six rounds of propagation reach (some 100 segments in a chain) may be split.
-    """
-    close = squared_distance(centre_m, centre_m) < jnp.square(0.5 * (reach_m[:, None] + reach_m[None]))
-    close = (close & member[:, None] & member[None]) | jnp.eye(len(centre_m), dtype=bool)
-    index = jnp.arange(len(centre_m), dtype=jnp.int32)
-
-    def spread(_: Int[Array, ""], index: Int[Array, " segment"]) -> Int[Array, " segment"]:
-        index = jnp.max(jnp.where(close, index[None], -1), axis=1)
-        index = index[index]
-        return index[index]
-
-    return jax.lax.fori_loop(0, _ROUNDS, spread, index)
