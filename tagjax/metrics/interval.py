@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
 import scipy  # its submodules are imported at their first use: `stats` alone takes most of a second
+from jaxtyping import Float, Int
 
 from .mean import MaskedMean
 
