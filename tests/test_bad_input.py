@@ -159,6 +159,7 @@ def _many(number: int, count: int) -> TagReads:
 
 def test_more_than_64_tags_are_all_traced():
     live = _live(num_places=64, num_reads=256)
+    _process(live, 2, reads=_many(2, 70))
     found = _process(live, 3, reads=_many(3, 70))
     assert {"tag-a", "tag-b", *(f"tag-{place}" for place in range(70))} == set(found.places)
     assert found.trace.tags.confidence.shape == (128,)

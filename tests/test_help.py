@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import re
 import subprocess
@@ -24,6 +25,7 @@ COMMANDS = sorted(path.stem for path in CONF.glob("*.yaml"))
 OPTUNA = any("optuna" in plugin.__module__ for plugin in Plugins.instance().discover(Sweeper))  # of the sweep extra
 
 
+@functools.cache
 def _help(command: str, *overrides: str) -> str:
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3", job_name=command):
         config = compose(command, list(overrides), return_hydra_config=True)
@@ -62,6 +64,8 @@ def test_every_choice_that_is_listed_can_be_chosen(name: str) -> None:
     groups = re.findall(r"^  ([\w@./]+)=(\S+)  \((.+)\)$", _help(name), re.MULTILINE)
     assert {"paths", "hydra/launcher"} <= {group for group, _, _ in groups}
     for group, _, choices in groups:
+        if group.startswith("hydra/") and name != COMMANDS[0]:
+            continue  # Hydra's own groups are the same files for every command
         for choice in choices.split(", ")[-1:]:
             if choice != "optuna" or OPTUNA:
                 with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
