@@ -62,6 +62,13 @@ def test_a_young_segment_that_is_connected_belongs_to_a_body_that_travels():
     assert after[8] < 0.05
 
 
+def test_a_body_that_is_in_front_of_nothing_takes_nothing_along():
+    found, moved = person()
+    behind = eqx.tree_at(lambda one: one.front, found, found.front.at[1:8].set(0.0))
+    after = WholeBody().completed(trunk(), behind, moved, ELAPSED)
+    np.testing.assert_allclose(after, trunk(), atol=0.01)
+
+
 def test_what_is_not_in_front_of_the_surface_at_rest_is_a_shadow():
     found, moved = person()
     shadow = eqx.tree_at(lambda one: one.front, found, found.front.at[jnp.array([5, 6])].set(0.2))

@@ -35,9 +35,11 @@ class Whole:
         body = connected(touching(found.centre_m[at], found.size_m[at]), joins[at] > 0.5)
         weight = membership * found.area
         total = weight.sum(axis=1)
-        goes = sigmoid(((weight @ travels) / np.where(total != 0, total, 1) - self.share) / np.float32(0.1))
         members = (body[:, None] == np.arange(len(at))[None]).astype(np.float32)
         of_body = (weight * travels * joins)[:, at] @ members
+        goes = sigmoid((of_body.max(axis=1) / np.where(total != 0, total, 1) - self.share) / np.float32(0.1))
+        least = one / (one + np.exp(self.share / np.float32(0.1)))
+        goes = (goes - least) / (1 - least)
         same = body[None] == np.argmax(of_body, axis=1)[:, None]
         more = np.where(same, np.float32(whole._MOST) * goes[:, None] * joins[at][None], zero)
         membership[:, at] = 1 - (1 - membership[:, at]) * (1 - more)

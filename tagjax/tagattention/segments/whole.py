@@ -28,7 +28,7 @@ class WholeBody(eqx.Module):
     """Stage that completes bodies that travel. `WholeBody()` has good values."""
 
     travel_m_s: Positive  # net displacement over `lag_s`, above which a segment travels
-    share: Fraction  # a body travels where so much of it does
+    share: Fraction  # a body travels where so much of it does, connected and in front
     lag_s: float = eqx.field(static=True)
     num_active: int = eqx.field(static=True)  # segments that are looked at: those that most likely travel
 
@@ -69,12 +69,15 @@ class WholeBody(eqx.Module):
         _, at = jax.lax.top_k(jax.lax.stop_gradient(joins), min(self.num_active, num_segments))
         body = self._connected(found.centre_m[at], found.size_m[at], joins[at] > 0.5)
 
+        least = jax.nn.sigmoid(-self.share.value / 0.1)  # a body of which nothing travels takes nothing along
+
         def of_tag(own: Float[Array, " segment"]) -> Float[Array, " segment"]:
             weight = own * found.area
-            share = safe_divide(weight @ travels, jnp.sum(weight))
-            goes = jax.nn.sigmoid((share - self.share.value) / 0.1)
             of_body = jax.ops.segment_sum((weight * travels * joins)[at], body, at.shape[0])
-            same = body == jnp.argmax(of_body).astype(body.dtype)
+            most = jnp.argmax(of_body).astype(body.dtype)
+            share = safe_divide(of_body[most], jnp.sum(weight))
+            goes = (jax.nn.sigmoid((share - self.share.value) / 0.1) - least) / (1.0 - least)
+            same = body == most
             more = jnp.where(same, _MOST * goes * joins[at], 0.0)
             return own.at[at].set(1.0 - (1.0 - own[at]) * (1.0 - more))
 
