@@ -181,6 +181,6 @@ class Body:
             weight = size * sigmoid(log_odds)
             weight = weight + np.float32(0.2) * weight.sum(axis=1, keepdims=True) * start
         member = log_odds > 0
-        log_odds[member & ~reached(touching(centre, size_m), member, peak)] = original._APART
+        log_odds = np.where(member & ~reached(touching(centre, size_m), member, peak), -log_odds, log_odds)
         after = keep * memory + (1 - keep) * np.clip(ratio + against, -4, 4)
         return log_odds, place, np.clip(after, -4, 4)

@@ -20,7 +20,7 @@ from .past_motion import PastMotion
 from .rigid import RigidMotion
 
 _TINY = 1e-9
-_APART = -30.0  # log odds of what is not looked at, or not connected with the place
+_APART = -30.0  # log odds of what is not looked at
 
 
 class BodyState(eqx.Module):
@@ -202,7 +202,7 @@ class CarryingBody(eqx.Module):
             (_, log_odds, ratio), _ = jax.lax.scan(alternate, begin, None, length=self.num_rounds)
             # A body is one connected thing. Whatever else moves as it does belongs to something else.
             member = log_odds > 0
-            log_odds = jnp.where(member & ~reached(touch, member, peak), _APART, log_odds)
+            log_odds = jnp.where(member & ~reached(touch, member, peak), -log_odds, log_odds)  # continuous at 0
             after = keep * memory + (1.0 - keep) * jnp.clip(ratio + against, -4.0, 4.0)
             return log_odds, place, jnp.clip(after, -4.0, 4.0)
 
