@@ -24,7 +24,15 @@ from tagjax.evaluation.run import EvaluateConfig, run_evaluation
 from tagjax.recording import Recording
 from tagjax.recording.store import save_recording
 from tagjax.tagattention.learned import load_parameters, save_parameters
-from tagjax.tagattention.segments import CarryingBody, Detection, RigidMotion, Segmenter, SegmentTracker, TagAttention
+from tagjax.tagattention.segments import (
+    CarryingBody,
+    Detection,
+    RigidMotion,
+    Segmenter,
+    SegmentTracker,
+    TagAttention,
+    connection,
+)
 from tagjax.tagattention.tracer_settings import learned_tracer, make_tracer
 from tagjax.tracing.tracer import trace
 from tagjax.training.config import TrainConfig
@@ -112,28 +120,37 @@ def test_training_traces_what_the_tracer_traces(clip, memory: float) -> None:
     assert float(jnp.max(expected.mask)) > 0.9
 
 
-@pytest.mark.xfail(reason="leaving out what is not connected is a hard cut: body.rigid.noise_m differs by 9 %")
 @pytest.mark.ci
-def test_parameters_have_the_gradients_of_central_differences(clip) -> None:
+@pytest.mark.parametrize("cut", [False, True])
+def test_parameters_have_the_gradients_of_central_differences(clip, cut: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With `cut` the body leaves out what is not connected with its place.
+
+    The objects are millimetres wide, and the errors of their depth centimetres. Within 8 cm all segments of an object are
+    neighbours of all others, so that which is the middle of the place would be decided by rounding. Without the cut it does
+    not matter; with it fewer are neighbours, of which some pairs are always just about to be.
+    """
+    names = ["reader.spread_rad", "body.rigid.noise_m", "body.rigid.most", "body.prior", "dwell.memory_s"]
+    if cut:
+        body = {"neighbour_m": 0.02}
+    else:
+        body = {}
+        names.append("body.neighbour_m")
+        monkeypatch.setattr(connection, "GAP", 100.0)
     # Bounds that no sum of two lags meets exactly: at a kink both differences and gradients are between two values.
     with jax.enable_x64(True):
-        tracer = _in_double(_tracer(rigid=RigidMotion(most=1.9, least=3.7)))
+        tracer = _in_double(_tracer(rigid=RigidMotion(most=1.9, least=3.7), **body))
         camera, frames = _in_double(clip.camera), _in_double(clip.frames)
         every_term = dataclasses.replace(OBJECTIVE, area=0.5, compactness=0.5, steadiness=0.5, calibration=0.2)
         assert set(every_term.weights()) == set(TERM_NAMES)
         gradient, logged = clip_gradient(tracer, camera, frames, KEY, every_term)
         assert np.isfinite(float(logged["loss"]))
-        for name, seen in (
-            *((name, True) for name in ("reader.spread_rad", "body.rigid.noise_m", "body.rigid.most")),
-            *((name, True) for name in ("body.neighbour_m", "body.prior", "dwell.memory_s")),
-            ("detection.elsewhere", True),
-        ):
+        for name in (*names, "detection.elsewhere"):
             of = operator.attrgetter(name)
             leaf = lambda m, of=of: getattr(of(m), "unconstrained", of(m))  # noqa: E731
             ends = [eqx.tree_at(leaf, tracer, leaf(tracer) + step) for step in (1e-6, -1e-6)]
             high, low = (float(clip_loss(one, camera, frames, KEY, every_term)["loss"]) for one in ends)
             assert float(leaf(gradient)) == pytest.approx((high - low) / 2e-6, rel=1e-3, abs=1e-8), name
-            assert (abs(high - low) > 1e-11) == seen, name
+            assert abs(high - low) > 1e-11, name
 
 
 def test_every_parameter_has_a_finite_gradient_and_only_these_have_none(clip) -> None:
