@@ -79,17 +79,8 @@ def test_a_swinging_leg_belongs_to_the_walker_and_what_stays_behind_does_not(apa
     frames = list(walker(apart=apart))
     for (centre, _, now_s), (travel, _) in zip(frames, travelled(TravellingTogether(), frames), strict=True):
         state, bodies = step(
-            state,
-            evidence,
-            centre,
-            AREA,
-            jnp.full(NUM, 0.1),
-            travel.life_s,
-            travel.displacement_m,
-            travel.source,
-            last_s,
-            now_s,
-        )
+            state, evidence, centre, AREA, jnp.full(NUM, 0.1), travel.life_s, travel.displacement_m, travel.source, last_s, now_s
+        )  # fmt: skip
         last_s = now_s
     member = np.asarray(bodies.log_odds)[0] > 0
     assert member[1:13].all()

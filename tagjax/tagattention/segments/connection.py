@@ -23,7 +23,7 @@ def touching(centre_m: Float[Array, "segment 3"], size_m: Float[Array, " segment
 def connected(touch: Bool[Array, "segment segment"], member: Bool[Array, " segment"]) -> Int[Array, " segment"]:
     """The largest index of a segment in each one's connected component; a segment that is no member is one by itself.
 
-    Components whose diameter exceeds what six rounds of propagation reach (some 100 segments in a chain) may be split.
+    A chain of more than some 100 segments may be split: indices are passed on six times.
     """
     touch = (touch & member[:, None] & member[None]) | jnp.eye(len(member), dtype=bool)
     index = jnp.arange(len(member), dtype=jnp.int32)
@@ -40,9 +40,9 @@ def reached(
     touch: Bool[Array, "segment segment"], member: Bool[Array, " segment"], start: Int[Array, ""]
 ) -> Bool[Array, " segment"]:
     """Members that are connected with the segment `start` by members, itself included, in at most 16 steps."""
-    begin = jnp.arange(len(member)) == start
+    begin, neighbours = jnp.arange(len(member)) == start, touch.astype(jnp.float32)
 
     def spread(_: Int[Array, ""], found: Float[Array, " segment"]) -> Float[Array, " segment"]:
-        return (begin | (member & (touch.astype(found.dtype) @ found > 0))).astype(found.dtype)
+        return (begin | (member & (neighbours @ found > 0))).astype(found.dtype)
 
     return jax.lax.fori_loop(0, _STEPS, spread, begin.astype(jnp.float32)) > 0

@@ -52,6 +52,7 @@ class Labelling(eqx.Module):
 
     counted: Bool[Array, "height width"]  # kept its label, or belongs to a new segment and shows a surface seen before
     source: Int[Array, " segment"]  # slot (of the frame before) that a new segment comes from, -1 = none; -2 = not new
+    front: Float[Array, " segment"]  # fraction of its pixels in front of all that has been seen at rest there
     num_unplaced: Int[Array, ""]  # new segments that found no free slot
 
 
@@ -221,7 +222,8 @@ class Segmenter(eqx.Module):
             is_new = source > NOT_NEW
 
         points = [rays[..., axis] * depth_m for axis in range(3)]
-        area, *summed = slot_sums([one, *points], valid & (labels >= 0), labels, self.num_segments)
+        in_front = background.front.astype(depth_m.dtype)
+        area, front, *summed = slot_sums([one, in_front, *points], valid & (labels >= 0), labels, self.num_segments)
         centre = jnp.stack(summed, axis=-1) / jnp.maximum(area, 1.0)[:, None]
         lives = (area > 0) & ~is_new
         after = SegmentState(
@@ -234,7 +236,7 @@ class Segmenter(eqx.Module):
             area=area,
             centre_m=centre,
         )
-        return after, Labelling(counted, source, num_unplaced)
+        return after, Labelling(counted, source, front / jnp.maximum(area, 1.0), num_unplaced)
 
     def displaced(
         self, state: SegmentState, motion_m: Float[Array, "segment 3"], source: Int[Array, " segment"]

@@ -12,7 +12,7 @@ from .background import Background, BackgroundState, BackgroundView
 from .carry import on_surface
 from .cells import NO_LABEL, NOT_NEW
 from .increments import segment_motion
-from .labels import Segmenter, SegmentState, slot_sums
+from .labels import Segmenter, SegmentState
 
 
 class SegmentFrame(eqx.Module):
@@ -91,8 +91,6 @@ class SegmentTracker(eqx.Module):
             self.segmenter.max_change_m(dt_s), self.segmenter.num_segments, self.segmenter.min_measured,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
-        of_segment = valid & (segments.labels >= 0)
-        (in_front,) = slot_sums([view.front.astype(depth_m.dtype)], of_segment, segments.labels, segments.area.shape[0])
         seen = jnp.any(valid)
         kept = jax.tree.map(lambda new, old: jnp.where(seen, new, old), segments, state.segments)
         frame = SegmentFrame(
@@ -106,7 +104,7 @@ class SegmentTracker(eqx.Module):
             life_s=kept.life_s,
             displacement_m=kept.displacement_m,
             moved=kept.moved,
-            front=jnp.where(seen, in_front / jnp.maximum(segments.area, 1.0), 0.0),
+            front=jnp.where(seen, found.front, 0.0),
             source=jnp.where(seen, found.source, NOT_NEW),
             num_unplaced=found.num_unplaced,
             background_lost=jax.lax.stop_gradient(view.lost),
