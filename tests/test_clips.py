@@ -19,7 +19,7 @@ from tagjax.core.settings import ConfigError
 from tagjax.recording import Recording, RecordingError, RecordingWarning, TagReads
 from tagjax.recording.loading import VirtualTagSettings
 from tagjax.recording.reads import join_reads
-from tagjax.tracing.clips import ClipSettings, choose_antennas, clip_loader, load_clip
+from tagjax.tracing.clips import ClipSettings, choose_antennas, clip_loader, load_clip, subsampled_depth
 from tagjax.training.clip_dataset import clip_dataset, measured_motion
 from tagjax.training.sources import DataSettings, training_recordings
 
@@ -47,6 +47,21 @@ def test_a_clip_has_about_256_columns_unless_a_stride_is_given(recording: Record
         assert automatic.frames.depth_m.shape == (6, 192, 256)
         np.testing.assert_array_equal(automatic.camera.rays, given.camera.rays)
         np.testing.assert_array_equal(automatic.frames.depth_m, given.frames.depth_m)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_missing_depth_comes_from_the_nearest_pixel_of_the_cell(stride: int) -> None:
+    rng = np.random.default_rng(stride)
+    depth_m = rng.uniform(0.5, 4.0, (2, 13, 17)).astype(np.float32)
+    for missing in (0.0, np.nan, np.inf, -np.inf):
+        depth_m[rng.uniform(size=depth_m.shape) < 0.2] = missing
+    expected = np.zeros((2, -(-13 // stride), -(-17 // stride)), np.float32)
+    for t, row, column in np.ndindex(expected.shape):
+        cell = depth_m[t, row * stride : (row + 1) * stride, column * stride : (column + 1) * stride]
+        places = [place for place in np.ndindex(cell.shape) if np.isfinite(cell[place]) and cell[place] > 0]
+        if places:
+            expected[t, row, column] = cell[min(places, key=lambda place: (place[0] ** 2 + place[1] ** 2, place))]
+    np.testing.assert_array_equal(subsampled_depth(depth_m, stride), expected)
 
 
 @pytest.mark.parametrize(

@@ -121,16 +121,13 @@ def selected_tags(recording: Recording, epcs: Sequence[str] | None) -> tuple[str
 
 
 def subsampled_depth(depth_m: np.ndarray, stride: int) -> np.ndarray:
-    """Every stride-th pixel; where its depth is missing, the nearest valid one of its stride x stride cell."""
-    height, width = depth_m.shape[1:]
-    padded = np.pad(depth_m, ((0, 0), (0, -height % stride), (0, -width % stride)))
-    cells = padded.reshape(len(depth_m), padded.shape[1] // stride, stride, padded.shape[2] // stride, stride)
-    cells = cells.transpose(0, 1, 3, 2, 4).reshape(*cells.shape[:2], padded.shape[2] // stride, stride * stride)
-    offset = np.arange(stride)
-    order = np.argsort((offset[:, None] ** 2 + offset[None, :] ** 2).reshape(-1), kind="stable")
-    ranked = cells[..., order]
-    first = np.argmax(ranked > 0, axis=-1)
-    return np.take_along_axis(ranked, first[..., None], axis=-1)[..., 0]
+    """Every stride-th pixel; where its depth is missing, the nearest valid one of its stride x stride cell, or 0."""
+    out = np.zeros((len(depth_m), *(-(-size // stride) for size in depth_m.shape[1:])), depth_m.dtype)
+    for down, right in sorted(np.ndindex(stride, stride), key=lambda place: place[0] ** 2 + place[1] ** 2):
+        one = depth_m[:, down::stride, right::stride]
+        place = out[:, : one.shape[1], : one.shape[2]]
+        np.copyto(place, one, where=(place == 0) & (one > 0) & (one < np.inf))
+    return out
 
 
 def load_clip(

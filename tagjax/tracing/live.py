@@ -9,8 +9,9 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Hashable
+from functools import partial
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -102,13 +103,14 @@ class LiveTracer:
         self._camera = Camera(
             rays=jnp.asarray(pixel_rays(intrinsics.scaled(stride))), antennas_m=jnp.asarray(chosen, jnp.float32)
         )
-        self._no_flow = jnp.zeros((*self._camera.rays.shape[:2], 2))
+        self._fixed = _Fixed.of(tracer, self._camera)
         self._places: list[str | None] = [None] * num_places
         self._last_read_ns: dict[str, int] = {}
         self._state: Any = None
         self._colour: np.ndarray | None = None
         self._time_ns, self._origin_ns, self._begun_ns = 0, 0, 0
         self._crowded = False
+        self._moved: Any = None  # whether the camera has moved, as of the last frame
         self.camera_moved = False
 
     def process(self, colour: np.ndarray, depth_m: np.ndarray, time_ns: int, reads: TagReads) -> LiveFrame:
@@ -128,7 +130,6 @@ class LiveTracer:
             )
         if first:
             self._begun_ns = self._origin_ns = self._time_ns = time_ns
-        depth_m = np.nan_to_num(depth_m, nan=0.0, posinf=0.0, neginf=0.0)
         depth_m = range_to_depth(depth_m[None], self._intrinsics)[0] if self._range else depth_m
         depth_m = subsampled_depth(depth_m[None], self._stride)[0]
         if self._colour is None:
@@ -142,11 +143,11 @@ class LiveTracer:
             reads, epcs, self._antennas, np.array([time_ns]), self._origin_ns, self._num_reads,
             since_ns=self._time_ns if not first else None,
         )  # fmt: skip
-        frame = self._frame((time_ns - self._origin_ns) * 1e-9, depth_m, backward_px, arrivals)
+        sensed = self._sensed((time_ns - self._origin_ns) * 1e-9, depth_m, backward_px, arrivals)
         if first:
-            self._state = _init(self._tracer, self._camera, frame)
+            self._state = _init(self._fixed.others, self._fixed.arrays, sensed)
         self._warn_of_motion()
-        self._state, trace = _follow((self._tracer, self._camera, frame), self._state)
+        self._state, trace, self._moved = _follow(self._fixed.others, self._fixed.arrays, sensed, self._state)
         self._colour, self._time_ns = colour, time_ns
         if (later_s := (time_ns - self._origin_ns) * 1e-9 // _REBASE_S * _REBASE_S) > 0:
             self._state = _shifted(self._tracer, self._state, jnp.asarray(-later_s, jnp.float32))
@@ -158,7 +159,7 @@ class LiveTracer:
 
     def _warn_of_motion(self) -> None:
         """Warn where the camera has moved before this frame: what the last one says is on the host by now."""
-        if self.camera_moved or (moved := self._tracer.camera_moved(self._state)) is None or not bool(moved):
+        if self.camera_moved or self._moved is None or not bool(self._moved):
             return
         self.camera_moved = True
         at_s = (self._time_ns - self._begun_ns) * 1e-9
@@ -172,24 +173,19 @@ class LiveTracer:
             TagReads.empty(), [f"\0{place}" for place in range(len(self._places))], self._antennas, np.array([0]), 0,
             self._num_reads,
         )  # fmt: skip
-        frame = self._frame(
-            0.0, np.zeros((height, width), np.float32), np.zeros((height, width, 2), np.float32), arrivals
-        )
-        state = _init(self._tracer, self._camera, frame)
-        jax.block_until_ready(_follow((self._tracer, self._camera, frame), state))
+        no_depth = np.zeros((height, width), np.float32)
+        sensed = self._sensed(0.0, no_depth, np.zeros((height, width, 2), np.float32), arrivals)
+        state = _init(self._fixed.others, self._fixed.arrays, sensed)
+        jax.block_until_ready(_follow(self._fixed.others, self._fixed.arrays, sensed, state))
         return time.perf_counter() - begun
 
-    def _frame(self, time_s: float, depth_m: np.ndarray, backward_px: np.ndarray, arrivals: Arrivals) -> Frame:
-        num_tags, num_antennas = len(self._places), len(self._antennas)
-        return Frame(
-            time_s=jnp.asarray(time_s, jnp.float32),
-            depth_m=jnp.asarray(depth_m, jnp.float32),
-            backward_px=jnp.asarray(backward_px, jnp.float32),
-            forward_px=self._no_flow,
-            radio=RadioWindow(jnp.zeros((num_tags, num_antennas, 2)), jnp.full((num_tags, num_antennas, 2), jnp.inf)),
-            reads=_no_reads(num_tags, num_antennas),
-            arrivals=jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), arrivals),
-            present=jnp.asarray([epc is not None for epc in self._places]),
+    def _sensed(self, time_s: float, depth_m: np.ndarray, backward_px: np.ndarray, arrivals: Arrivals) -> _Sensed:
+        return _Sensed(
+            time_s=np.float32(time_s),
+            depth_m=np.asarray(depth_m, np.float32),
+            backward_px=np.asarray(backward_px, np.float32),
+            arrivals=jax.tree.map(lambda leaf: leaf[0], arrivals),
+            present=np.array([epc is not None for epc in self._places]),
         )
 
     def _admit(self, reads: TagReads, time_ns: int) -> None:
@@ -231,20 +227,63 @@ class LiveTracer:
             )
 
 
-def _no_reads(num_tags: int, num_antennas: int) -> PhaseReads:
-    zero: Any = np.zeros((num_tags, num_antennas, 1), np.float32)
-    return PhaseReads(zero, zero, zero, zero, zero.astype(np.int32), zero > 0)
+class _Sensed(NamedTuple):
+    """What a frame brings, on the host: the rest of a `Frame` is made on the device."""
+
+    time_s: Any
+    depth_m: Any
+    backward_px: Any
+    arrivals: Arrivals
+    present: Any
+
+    def frame(self, num_antennas: int) -> Frame:
+        """The tracer's input; it has no window of phases, which nothing that runs live uses."""
+        rows = self.present.shape[0], num_antennas
+        none = jnp.zeros((*rows, 1))
+        return Frame(
+            time_s=self.time_s,
+            depth_m=self.depth_m,
+            backward_px=self.backward_px,
+            forward_px=jnp.zeros_like(self.backward_px),
+            radio=RadioWindow(jnp.zeros((*rows, 2)), jnp.full((*rows, 2), jnp.inf)),
+            reads=PhaseReads(none, none, none, none, none.astype(jnp.int32), none > 0),
+            arrivals=self.arrivals,
+            present=self.present,
+        )
 
 
-@eqx.filter_jit
-def _init(tracer: LiveMethod, camera: Camera, frame: Frame) -> Any:
-    return tracer.init(camera, frame)
+@dataclasses.dataclass(frozen=True)
+class _Fixed:
+    """Tracer and camera, taken apart once: to do so for every frame takes as long as its depth."""
+
+    arrays: list[Array | None]
+    others: Hashable  # a part of the compiled program
+
+    @staticmethod
+    def of(tracer: LiveMethod, camera: Camera) -> _Fixed:
+        leaves, structure = jax.tree.flatten((tracer, camera))
+        arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
+        return _Fixed(arrays, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)))
 
 
-@eqx.filter_jit(donate="all-except-first")
-def _follow(inputs: tuple[LiveMethod, Camera, Frame], state: Any) -> tuple[Any, Any]:
-    tracer, camera, frame = inputs
-    return tracer.follow(camera, state, frame)
+def _joined(others: Any, arrays: list[Array | None]) -> tuple[LiveMethod, Camera]:
+    structure, leaves = others
+    pairs = zip(arrays, leaves, strict=True)
+    return jax.tree.unflatten(structure, [leaf if array is None else array for array, leaf in pairs])
+
+
+@partial(jax.jit, static_argnums=0)
+def _init(others: Hashable, arrays: list[Array | None], sensed: _Sensed) -> Any:
+    tracer, camera = _joined(others, arrays)
+    return tracer.init(camera, sensed.frame(camera.antennas_m.shape[0]))
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=3)
+def _follow(others: Hashable, arrays: list[Array | None], sensed: _Sensed, state: Any) -> tuple[Any, Any, Any]:
+    """The next state, the output, and whether the camera has moved."""
+    tracer, camera = _joined(others, arrays)
+    state, trace = tracer.follow(camera, state, sensed.frame(camera.antennas_m.shape[0]))
+    return state, trace, tracer.camera_moved(state)
 
 
 @eqx.filter_jit

@@ -55,6 +55,13 @@ class Labelling(eqx.Module):
     front: Float[Array, " segment"]  # fraction of its pixels in front of all that has been seen at rest there
     num_unplaced: Int[Array, ""]  # new segments that found no free slot
 
+    @staticmethod
+    def nothing(height: int, width: int, num_segments: int) -> Labelling:
+        """Of a frame that shows nothing."""
+        counted = jnp.zeros((height, width), bool)
+        source = jnp.full(num_segments, NOT_NEW, jnp.int32)
+        return Labelling(counted, source, jnp.zeros(num_segments), jnp.zeros((), jnp.int32))
+
 
 def slot_sums(
     values: Sequence[Float[Array, "height width"]],
@@ -204,10 +211,7 @@ class Segmenter(eqx.Module):
         labels = jnp.where((labels > 0) & ~small[jnp.maximum(labels, 0)], labels, NO_LABEL)
 
         hole = foreground & (labels < 0) & ~first
-        new, source, num_unplaced = births(
-            hole, side, carried, free, min_side_px=self.min_side_px, min_pixels=self.min_pixels
-        )
-        labels = jnp.where(new > 0, new, labels)
+        labels, source, num_unplaced = self._born(labels, hole, side, carried, free)
         # Of the first frame's segments nothing is known of where they come from.
         source = jnp.where(first & ~free & (slots != STATIC), NO_LABEL, source)
         is_new = source > NOT_NEW
@@ -270,6 +274,28 @@ class Segmenter(eqx.Module):
         row, column = jnp.arange(height, dtype=jnp.int32) // side_px, jnp.arange(width, dtype=jnp.int32) // side_px
         block = row[:, None] * -(-width // side_px) + column[None] + 1
         return jnp.where(foreground, block, NO_LABEL), jnp.asarray(side_px, float)
+
+    def _born(
+        self,
+        labels: Int[Array, "height width"],
+        hole: Bool[Array, "height width"],
+        side_px: Float[Array, "height width"],
+        carried: Int[Array, "height width"],
+        free: Bool[Array, " segment"],
+    ) -> tuple[Int[Array, "height width"], Int[Array, " segment"], Int[Array, ""]]:
+        """Labels with those of `births`, each slot's source, and the number of new segments without a slot."""
+
+        def some() -> tuple[Array, Array, Array]:
+            new, *others = births(
+                hole, side_px, carried, free, min_side_px=self.min_side_px, min_pixels=self.min_pixels
+            )
+            return jnp.where(new > 0, new, labels), *others
+
+        def none() -> tuple[Array, Array, Array]:
+            return labels, jnp.full(free.shape, NOT_NEW, jnp.int32), jnp.zeros((), jnp.int32)
+
+        # What a branch returns is computed once; XLA would compute the labels anew for each of their uses.
+        return jax.lax.cond(jnp.any(hole), some, none)
 
     def _reassigned(
         self,

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ...tracing.tracer import Camera, stored
 from .background import Background, BackgroundState, BackgroundView
 from .carry import on_surface
-from .cells import NO_LABEL, NOT_NEW
+from .cells import NO_LABEL
 from .increments import segment_motion
-from .labels import Segmenter, SegmentState
+from .labels import Labelling, Segmenter, SegmentState
 
 
 class SegmentFrame(eqx.Module):
@@ -82,8 +82,15 @@ class SegmentTracker(eqx.Module):
             background, view = self.background.step(state.background, depth_m, valid, backward_px, dt_s, focal)
         if moves_later is not None:
             view = view.without(moves_later)
-        segments, found = self.segmenter.step(
-            state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal, objects
+        seen = jnp.any(valid)
+        given = jax.lax.stop_gradient((camera.rays, depth_m, backward_px, view, dt_s, focal))
+
+        def looked() -> tuple[SegmentState, Labelling]:
+            rays, depth_m, backward_px, view, dt_s, focal = given
+            return self.segmenter.step(state.segments, rays, depth_m, valid, backward_px, view, dt_s, focal, objects)
+
+        segments, found = jax.lax.cond(
+            seen, looked, lambda: (state.segments, Labelling.nothing(*depth_m.shape, self.segmenter.num_segments))
         )
         labels, counted = stored((segments.labels, found.counted))
         motion = segment_motion(
@@ -91,25 +98,23 @@ class SegmentTracker(eqx.Module):
             self.segmenter.max_change_m(dt_s), self.segmenter.num_segments, self.segmenter.min_measured,
         )  # fmt: skip
         segments = self.segmenter.displaced(segments, motion.motion_m, found.source)
-        seen = jnp.any(valid)
-        kept = jax.tree.map(lambda new, old: jnp.where(seen, new, old), segments, state.segments)
         frame = SegmentFrame(
-            labels=jnp.where(seen, segments.labels, NO_LABEL),
+            labels=jnp.where(seen, labels, NO_LABEL),
             increment_m=motion.increment_m,
             motion_m=motion.motion_m,
             known=motion.known,
-            centre_m=kept.centre_m,
-            area=jnp.where(seen, kept.area, 0.0),
-            size_m=jnp.sqrt(kept.area) * kept.centre_m[:, 2] / focal,
-            life_s=kept.life_s,
-            displacement_m=kept.displacement_m,
-            moved=kept.moved,
-            front=jnp.where(seen, found.front, 0.0),
-            source=jnp.where(seen, found.source, NOT_NEW),
+            centre_m=segments.centre_m,
+            area=jnp.where(seen, segments.area, 0.0),
+            size_m=jnp.sqrt(segments.area) * segments.centre_m[:, 2] / focal,
+            life_s=segments.life_s,
+            displacement_m=segments.displacement_m,
+            moved=segments.moved,
+            front=found.front,
+            source=found.source,
             num_unplaced=found.num_unplaced,
             background_lost=jax.lax.stop_gradient(view.lost),
         )
-        return SegmentTrackerState(background, kept), stored(frame)
+        return SegmentTrackerState(background, segments), stored(frame)
 
 
 def focal_px(camera: Camera) -> Float[Array, ""]:
