@@ -286,10 +286,10 @@ class Segmenter(eqx.Module):
         """Labels with those of `births`, each slot's source, and the number of new segments without a slot."""
 
         def some() -> tuple[Array, Array, Array]:
-            new, *others = births(
+            new, source, num_unplaced = births(
                 hole, side_px, carried, free, min_side_px=self.min_side_px, min_pixels=self.min_pixels
             )
-            return jnp.where(new > 0, new, labels), *others
+            return jnp.where(new > 0, new, labels), source, num_unplaced
 
         def none() -> tuple[Array, Array, Array]:
             return labels, jnp.full(free.shape, NOT_NEW, jnp.int32), jnp.zeros((), jnp.int32)

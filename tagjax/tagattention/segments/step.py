@@ -89,9 +89,8 @@ class SegmentTracker(eqx.Module):
             rays, depth_m, backward_px, view, dt_s, focal = given
             return self.segmenter.step(state.segments, rays, depth_m, valid, backward_px, view, dt_s, focal, objects)
 
-        segments, found = jax.lax.cond(
-            seen, looked, lambda: (state.segments, Labelling.nothing(*depth_m.shape, self.segmenter.num_segments))
-        )
+        nothing = Labelling.nothing(depth_m.shape[0], depth_m.shape[1], self.segmenter.num_segments)
+        segments, found = jax.lax.cond(seen, looked, lambda: (state.segments, nothing))
         labels, counted = stored((segments.labels, found.counted))
         motion = segment_motion(
             camera, labels, counted, depth_m, state.segments.depth_m, backward_px,
