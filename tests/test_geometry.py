@@ -98,7 +98,7 @@ def test_interpolated_pictures_are_rounded_not_cut():
     assert np.abs(straight[4:-4, 4:-4] - exact).max() < 0.5 + 1e-3
 
 
-@pytest.mark.parametrize("name", ["dis", "dis_stride4", "dis_fast", "dis_ultrafast", "farneback"])
+@pytest.mark.parametrize("name", ["dis", "dis_live", "dis_fast", "dis_ultrafast", "farneback"])
 def test_flow_baselines_see_a_shift(name):
     texture = cv2.GaussianBlur(RNG.integers(0, 255, (140, 180)).astype(np.uint8), (0, 0), 2)
     texture = np.rint((texture - texture.min()) * (255 / np.ptp(texture))).astype(np.uint8)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Shaped
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 """Speed of light in vacuum, m/s (exact, SI)."""
@@ -30,6 +30,11 @@ def safe_divide(numerator: Float[Array, "*shape"], denominator: Float[Array, "*s
     """Quotient that is 0, with gradient 0, where the denominator is 0."""
     nonzero = denominator != 0
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)
+
+
+def entries(table: Shaped[Array, " entry"], index: Int[Array, "*shape"]) -> Shaped[Array, "*shape"]:
+    """The entries at indices that lie within the table, without the operations for those that do not."""
+    return table.at[index].get(mode="promise_in_bounds")
 
 
 def safe_atan2(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

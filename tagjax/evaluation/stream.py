@@ -36,7 +36,7 @@ class StreamConfig:
     recording: str
     tracer: Mapping[str, Any]
     weights: str | None = None
-    flow: str = "dis_stride4"
+    flow: str = "dis_live"
     stride: int | None = None  # None: that of the tracer's settings, or else of the picture's width
     num_places: int = 4  # for tags, before more are made
     replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)

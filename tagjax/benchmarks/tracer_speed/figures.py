@@ -35,7 +35,7 @@ class TracerSpeedSettings:
     width: int = 512  # of the simulated pictures
     simulated_frames: int = 90
     stride: int = 2  # every n-th pixel
-    flow: str = "dis_stride4"
+    flow: str = "dis_live"
     frames: int = 600  # of the longest run; those after the first 300 say whether time grows with the recording
     part_frames: int = 120  # of the other runs
     processes: bool = True  # also measure fresh processes: first mask, memory

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...core.numerics import entries
 from ...image.warp import pixel_grid
 from .cells import NO_LABEL
 
@@ -47,6 +48,6 @@ def carried_labels(
     at_x = jnp.clip(jnp.round(x + dither_px[0]), 0, width - 1)
     at_y = jnp.clip(jnp.round(y + dither_px[1]), 0, height - 1)
     index = jnp.where(inside, at_y * width + at_x, 0.0).astype(jnp.int32)
-    before_m = last_depth_m.reshape(-1)[index]
+    before_m = entries(last_depth_m.reshape(-1), index)
     same = valid & inside & (before_m > 0) & (jnp.abs(depth_m - before_m) < max_change_m)
-    return jnp.where(same, last_labels.reshape(-1)[index], NO_LABEL)
+    return jnp.where(same, entries(last_labels.reshape(-1), index), NO_LABEL)

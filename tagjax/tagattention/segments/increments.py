@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ...core.numerics import safe_sqrt
+from ...core.numerics import entries, safe_sqrt
 from ...image.warp import pixel_grid
 from ...tracing.tracer import Camera
 from .labels import STATIC, slot_sums
@@ -51,24 +51,22 @@ def pixel_sources(
     left, top = jnp.floor(x), jnp.floor(y)
     right_weight, down_weight = x - left, y - top
     column, row = left.astype(jnp.int32), top.astype(jnp.int32)
-    depth = last_depth_m.reshape(-1)
-    index, weight = [], []
+    taps_m, weight = [], []
     for down in (0, 1):
         for right in (0, 1):
             below, beside = jnp.minimum(row + down, height - 1), jnp.minimum(column + right, width - 1)
-            index.append(below * width + beside)
+            taps_m.append(entries(last_depth_m.reshape(-1), below * width + beside))
             weight.append(
                 (down_weight if down else 1.0 - down_weight) * (right_weight if right else 1.0 - right_weight)
             )
-    nearest_row = jnp.where(down_weight > 0.5, jnp.minimum(row + 1, height - 1), row)
-    nearest_column = jnp.where(right_weight > 0.5, jnp.minimum(column + 1, width - 1), column)
-    nearest = depth[nearest_row * width + nearest_column]
-    for tap, at in enumerate(index):
-        same = (depth[at] > 0) & (jnp.abs(depth[at] - nearest) < _SAME_SURFACE * nearest)
+    above_m, below_m = (jnp.where(right_weight > 0.5, right_m, left_m) for left_m, right_m in (taps_m[:2], taps_m[2:]))
+    nearest_m = jnp.where(down_weight > 0.5, below_m, above_m)
+    for tap, tap_m in enumerate(taps_m):
+        same = (tap_m > 0) & (jnp.abs(tap_m - nearest_m) < _SAME_SURFACE * nearest_m)
         weight[tap] = jnp.where(same, weight[tap], 0.0)
     total = weight[0] + weight[1] + weight[2] + weight[3]
     known = inside & (total > _MIN_WEIGHT)
-    mixed = [one * depth[at] for one, at in zip(weight, index, strict=True)]
+    mixed = [one * tap_m for one, tap_m in zip(weight, taps_m, strict=True)]
     before_m = jnp.where(known, (mixed[0] + mixed[1] + mixed[2] + mixed[3]) / jnp.where(known, total, 1.0), 0.0)
     # Rays are affine in the pixel: a pinhole's, with z = 1.
     across = (rays[0, -1, 0] - rays[0, 0, 0]) / max(width - 1, 1)

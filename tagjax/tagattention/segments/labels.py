@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int
 
-from ...core.numerics import safe_norm
+from ...core.numerics import entries, safe_norm
 from ...core.parameters import check_positive, check_positive_integers
 from ...image.warp import pixel_grid
 from .background import BackgroundView
@@ -208,14 +208,14 @@ class Segmenter(eqx.Module):
         (number,) = slot_sums([one], labels > 0, labels, self.num_segments)
         small = number < max(self.min_pixels, 1)
         free = small & may_be_free
-        labels = jnp.where((labels > 0) & ~small[jnp.maximum(labels, 0)], labels, NO_LABEL)
+        labels = jnp.where((labels > 0) & ~entries(small, jnp.maximum(labels, 0)), labels, NO_LABEL)
 
         hole = foreground & (labels < 0) & ~first
         labels, source, num_unplaced = self._born(labels, hole, side, carried, free)
         # Of the first frame's segments nothing is known of where they come from.
         source = jnp.where(first & ~free & (slots != STATIC), NO_LABEL, source)
         is_new = source > NOT_NEW
-        follows = (labels == kept) | (is_new[jnp.maximum(labels, 0)] & (carried >= 0))
+        follows = (labels == kept) | (entries(is_new, jnp.maximum(labels, 0)) & (carried >= 0))
         counted = (labels > 0) & follows
         labels = jnp.where(valid & static, STATIC, labels)
         if objects is not None:
@@ -257,8 +257,8 @@ class Segmenter(eqx.Module):
         """Pixels of the static background. A segment that has moved keeps its pixels where it pauses."""
         unlabelled = carried <= 0
         slot = jnp.maximum(carried, 0)
-        moved = state.moved[slot] & ~unlabelled
-        older = background.age_s > jnp.where(unlabelled, 0.0, state.life_s[slot])
+        moved = entries(state.moved, slot) & ~unlabelled
+        older = background.age_s > jnp.where(unlabelled, 0.0, entries(state.life_s, slot))
         confirmed = background.confirmed & (unlabelled | ~background.matched | older | ~moved)
         return (
             confirmed
@@ -318,16 +318,11 @@ class Segmenter(eqx.Module):
             for right in (0, -1, 1):
                 y, x = row + down * step, column + right * step
                 inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
-                other = jnp.where(inside, _at(flat, jnp.where(inside, y * width + x, 0)), NO_LABEL)
+                other = jnp.where(inside, entries(flat, jnp.where(inside, y * width + x, 0)), NO_LABEL)
                 slot = jnp.maximum(other, 0)
-                apart = [jnp.square(own - _at(table, slot)) for own, table in zip(feature, centre, strict=True)]
+                apart = [jnp.square(own - entries(table, slot)) for own, table in zip(feature, centre, strict=True)]
                 away = (apart[0] + apart[1] + apart[2]) / jnp.square(side_px)
                 away = jnp.where(other == labels, away - _STAY, away)
                 better = (other > 0) & foreground & (away < best)
                 best, found = jnp.where(better, away, best), jnp.where(better, other, found)
         return found
-
-
-def _at(table: Shaped[Array, " entry"], index: Int[Array, "height width"]) -> Shaped[Array, "height width"]:
-    """The entries at indices that lie within the table, without the operations for those that do not."""
-    return table.at[index].get(mode="promise_in_bounds")
