@@ -11,9 +11,19 @@ import numpy as np
 
 from ...recording import Recording
 from ...recording.store import open_recording
+from ...tracing.tracer import Camera, Frame
 from ..timing import Figure, Timing
 from .live import frame_times_ms, start_times_s, stream_memory_mib
-from .stages import flow_times_ms, part_times_ms, prepared_frames, radio_times_ms, twin_times_ms
+from .stages import (
+    flow_times_ms,
+    machine_limits,
+    part_times_ms,
+    prepared_frames,
+    radio_times_ms,
+    step_cost,
+    step_times_ms,
+    twin_times_ms,
+)
 from .swing import Swing, stored_scene
 
 _FEW, _MANY = 4, 64
@@ -38,6 +48,7 @@ class TracerSpeedSettings:
     flow: str = "dis_live"
     frames: int = 600  # of the longest run; those after the first 300 say whether time grows with the recording
     part_frames: int = 120  # of the other runs
+    scaling: bool = True  # also measure a step for other numbers of tags and pixels, and the machine's limits
     processes: bool = True  # also measure fresh processes: first mask, memory
 
     def __post_init__(self) -> None:
@@ -56,6 +67,8 @@ def tracer_figures(settings: TracerSpeedSettings, seed: int) -> Iterator[Timing 
         recording = open_recording(path)
         yield from _whole(settings, recording)
         yield from _parts(settings, recording, seed)
+        if settings.scaling:
+            yield from _scaling(settings, recording)
         if settings.processes:
             yield from _processes(settings, path)
 
@@ -102,6 +115,30 @@ def _parts(settings: TracerSpeedSettings, recording: Recording, seed: int) -> It
     ours, twin = radio_times_ms(_MANY, settings.part_frames, seed)
     yield Timing(f"reads of a frame, one of each of {_MANY} tags", ours, "NumPy twin", twin)
     yield Figure(f"radio side of a frame, {_MANY} tags", ours, "ms", 1.0)
+
+
+def _scaling(settings: TracerSpeedSettings, recording: Recording) -> Iterator[Figure]:
+    def prepared(num_tags: int, stride: int) -> tuple[Camera, list[Frame]]:
+        swing = Swing.of(recording, num_tags=num_tags)
+        return prepared_frames(swing, settings.part_frames, stride=stride, flow=settings.flow)
+
+    for num_tags in (1, _FEW, 16, _MANY):
+        times = step_times_ms(*prepared(num_tags, settings.stride))
+        yield Figure(f"step without flow, boxes only, tags: {num_tags}", float(np.median(times)), "ms")
+    for stride in (2 * settings.stride, settings.stride, max(1, settings.stride // 2)):
+        camera, frames = prepared(_FEW, stride)
+        height, width, _ = camera.rays.shape
+        times = step_times_ms(camera, frames)
+        yield Figure(f"step without flow, {_FEW} tags, pixels: {width}x{height}", float(np.median(times)), "ms")
+    camera, frames = prepared(_FEW, settings.stride)
+    cost, limits = step_cost(camera, frames[0]), machine_limits()
+    yield Figure("this machine copies", 1e-9 * limits["bytes_per_s"], "GB/s")
+    yield Figure("this machine multiplies matrices", 1e-9 * limits["flops_per_s"], "GFLOP/s")
+    for name, what in (("given_bytes", "inputs and outputs"), ("accessed_bytes", "all operations")):
+        yield Figure(f"step, {_FEW} tags: bytes of {what}", 1e-6 * cost[name], "MB")
+        yield Figure(f"... at the speed of a copy: {what}", 1e3 * cost[name] / limits["bytes_per_s"], "ms")
+    yield Figure(f"step, {_FEW} tags: floating point operations", 1e-6 * cost["flops"], "MFLOP")
+    yield Figure("... at the speed of a product of matrices", 1e3 * cost["flops"] / limits["flops_per_s"], "ms")
 
 
 def _processes(settings: TracerSpeedSettings, path: Path) -> Iterator[Figure]:

@@ -135,6 +135,58 @@ def part_times_ms(camera: Camera, frames: list[Frame]) -> dict[str, float]:
     return {name: float(np.median(own[_WARM_UP:])) for name, own in times.items()}
 
 
+def step_times_ms(camera: Camera, frames: list[Frame]) -> np.ndarray:
+    """Times of a step without the flow, (frame,) ms."""
+    tracer, times = TagAttention(), []
+    state = eqx.filter_jit(tracer.init)(camera, frames[0])
+    for frame in frames:
+        begun = time.perf_counter()
+        state, trace = _follow((tracer, camera, frame), state)
+        jax.block_until_ready(trace)
+        times.append(1e3 * (time.perf_counter() - begun))
+    return np.array(times[_WARM_UP:])
+
+
+def step_cost(camera: Camera, frame: Frame) -> dict[str, float]:
+    """What XLA counts of a step: bytes of all inputs and outputs, bytes that its operations read and write, and their FLOPs.
+
+    None of them depends on the frame's values.
+    """
+    tracer = TagAttention()
+    state = eqx.filter_jit(tracer.init)(camera, frame)
+    step = jax.jit(lambda camera, frame, state: tracer.follow(camera, state, frame), donate_argnums=2)
+    compiled = step.lower(camera, frame, state).compile()
+    memory, counted = compiled.memory_analysis(), compiled.cost_analysis()
+    assert memory is not None
+    assert counted is not None
+    return {
+        "given_bytes": float(memory.argument_size_in_bytes + memory.output_size_in_bytes),
+        "accessed_bytes": counted["bytes accessed"],
+        "flops": counted["flops"],
+    }
+
+
+def machine_limits() -> dict[str, float]:
+    """The highest rates that this machine shows: bytes/s read and written by a copy, and FLOP/s of a product of matrices."""
+    source = np.ones(2**25, np.float32)
+    target, matrix = np.empty_like(source), jnp.ones((2048, 2048))
+    product = jax.jit(lambda one: one @ one)
+    jax.block_until_ready(product(matrix))
+
+    def shortest_s(call: Callable[[], Any]) -> float:
+        times = []
+        for _ in range(7):
+            begun = time.perf_counter()
+            jax.block_until_ready(call())
+            times.append(time.perf_counter() - begun)
+        return min(times)
+
+    return {
+        "bytes_per_s": 2 * source.nbytes / shortest_s(lambda: np.copyto(target, source)),
+        "flops_per_s": 2 * 2048**3 / shortest_s(lambda: product(matrix)),
+    }
+
+
 def twin_times_ms(camera: Camera, frames: list[Frame], *, with_masks: bool) -> tuple[float, float]:
     """Median times of a step (without the flow) of the tracer and of its NumPy twin, whose frames alternate, ms."""
     tracer = TagAttention()
