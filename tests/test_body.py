@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from segments_scenes import segment_frame
 
-from tagjax.tagattention.segments import CarryingBody, RigidMotion
+from tagjax.tagattention.segments import CarryingBody, RigidMotion, SegmentFrame
 from tagjax.tagattention.segments.past_motion import PastMotion
 from tagjax.tagattention.segments.rigid import best_rotation, rigid_fit
 
@@ -150,7 +151,7 @@ def test_a_newborn_segment_has_no_past_of_the_slot_before():
     assert float(elapsed_s[1]) == pytest.approx(1 / 30)
 
 
-SIZE_M = jnp.full(21, 0.06)
+AREA = jnp.full(21, 16.0)
 
 
 def scene(num_frames: int = 30, *, rate_hz: float = 30.0, turned: bool = True):
@@ -172,6 +173,11 @@ def scene(num_frames: int = 30, *, rate_hz: float = 30.0, turned: bool = True):
         yield jnp.asarray(at, jnp.float32), jnp.asarray(at - start, jnp.float32), jnp.asarray(time_s, jnp.float32)
 
 
+def segments(centre_m, displacement_m, life_s, **others) -> SegmentFrame:
+    """The segments of a frame of `scene`."""
+    return segment_frame(centre_m, displacement_m, area=AREA, life_s=life_s, displacement_m=displacement_m, **others)
+
+
 @eqx.filter_jit
 def stepped(stage: CarryingBody, *arguments) -> tuple:
     """`step`, compiled once for all tests that have as many tags."""
@@ -179,15 +185,9 @@ def stepped(stage: CarryingBody, *arguments) -> tuple:
 
 
 def found(stage: CarryingBody, evidence: jax.Array, frames) -> tuple:
-    state = stage.init(evidence.shape[0], 21)
-    area = jnp.full(21, 16.0)
-    bodies, last_s = None, jnp.zeros(())
+    state, bodies, last_s = stage.init(evidence.shape[0], 21), None, jnp.zeros(())
     for centre, displacement, now_s in frames:
-        life_s = jnp.full(21, now_s)
-        source = jnp.full(21, -2, jnp.int32)
-        state, bodies = stepped(
-            stage, state, evidence, centre, area, SIZE_M, life_s, displacement, source, last_s, now_s
-        )
+        state, bodies = stepped(stage, state, evidence, segments(centre, displacement, now_s), last_s, now_s)
         last_s = now_s
     return state, bodies
 
@@ -222,11 +222,8 @@ def test_nothing_that_moves_and_no_tag_are_defined():
     assert bodies.log_odds.shape == (0, 21)
     stage = CarryingBody()
     state = stage.init(1, 21)
-    empty = jnp.zeros(21)
-    source = jnp.full(21, -2, jnp.int32)
-    _, bodies = stepped(
-        stage, state, jnp.zeros((1, 21)), jnp.zeros((21, 3)), empty, empty, empty, jnp.zeros((21, 3)), source, jnp.zeros(()), jnp.zeros(())
-    )  # fmt: skip
+    empty = segment_frame(jnp.zeros((21, 3)), jnp.zeros((21, 3)), area=jnp.zeros(21), size_m=0.0)
+    _, bodies = stepped(stage, state, jnp.zeros((1, 21)), empty, jnp.zeros(()), jnp.zeros(()))
     assert float(jnp.max(bodies.log_odds)) < -20
     assert float(jnp.sum(bodies.place)) == 0.0
 
@@ -234,14 +231,12 @@ def test_nothing_that_moves_and_no_tag_are_defined():
 @pytest.mark.parametrize(("size_m", "belongs"), [(0.05, False), (0.15, True)])
 def test_what_moves_alike_belongs_to_the_body_where_it_is_connected(size_m: float, belongs: bool):
     stage, evidence = CarryingBody(), jnp.zeros((1, 21)).at[0, 4].set(60.0)
-    state, bodies, last_s, source = stage.init(1, 21), None, jnp.zeros(()), jnp.full(21, -2, jnp.int32)
+    state, bodies, last_s = stage.init(1, 21), None, jnp.zeros(())
     for centre, displacement, now_s in scene():
         centre = centre.at[15:].set(centre[1:7].at[:, 0].add(0.3))
         displacement = displacement.at[15:].set(displacement[1:7])
-        state, bodies = stepped(
-            stage, state, evidence, centre, jnp.full(21, 16.0), jnp.full(21, size_m), jnp.full(21, now_s), displacement,
-            source, last_s, now_s,
-        )  # fmt: skip
+        now = segments(centre, displacement, now_s, size_m=size_m)
+        state, bodies = stepped(stage, state, evidence, now, last_s, now_s)
         last_s = now_s
     assert bodies is not None
     member = np.asarray(bodies.log_odds)[0] > 0
@@ -249,18 +244,34 @@ def test_what_moves_alike_belongs_to_the_body_where_it_is_connected(size_m: floa
     assert member[15:].all() == member[15:].any() == belongs
 
 
+@pytest.mark.parametrize(
+    ("life_s", "front", "age_s", "is_place"),
+    [(0.5, 0.0, 9.0, False), (0.5, 1.0, 9.0, True), (1.6, 0.0, 9.0, True), (0.5, 0.0, 1.0, True)],
+    ids=["uncovered", "in front", "old", "nothing seen at rest yet"],
+)
+def test_what_has_just_come_into_view_behind_is_no_place(life_s: float, front: float, age_s: float, is_place: bool):
+    stage, evidence = CarryingBody(), jnp.zeros((1, 21)).at[0, 15:].set(60.0).at[0, 1:9].set(30.0)
+    state, bodies, last_s = stage.init(1, 21), None, jnp.zeros(())
+    state = eqx.tree_at(lambda one: one.age_s, state, jnp.asarray(age_s - 1.0))
+    for centre, displacement, now_s in scene():
+        lives = jnp.full(21, 9.0).at[15:].set(life_s)
+        now = segments(centre, displacement, lives, front=jnp.zeros(21).at[15:].set(front))
+        state, bodies = stepped(stage, state, evidence, now, last_s, now_s)
+        last_s = now_s
+    assert bodies is not None
+    assert (float(jnp.sum(bodies.place[0, 15:])) > 0.9) == is_place
+    assert (float(jnp.sum(bodies.place[0, 1:9])) > 0.9) != is_place
+
+
 def test_membership_moves_on_with_the_place():
     evidence = jnp.zeros((1, 21)).at[0, 4].set(60.0)
     stage = CarryingBody()
     state, _ = found(stage, evidence, scene())
     assert float(state.membership[0, 4]) > 1.0
-    area, source = jnp.full(21, 16.0), jnp.full(21, -2, jnp.int32)
     frames = list(scene(32))
     centre, displacement, now_s = frames[30]
-    state, bodies = stepped(
-        stage, state, jnp.zeros((1, 21)).at[0, 17].set(60.0), centre, area, SIZE_M, jnp.full(21, now_s), displacement, source,
-        frames[29][2], now_s,
-    )  # fmt: skip
+    other = jnp.zeros((1, 21)).at[0, 17].set(60.0)
+    state, bodies = stepped(stage, state, other, segments(centre, displacement, now_s), frames[29][2], now_s)
     member = np.asarray(bodies.log_odds)[0] > 0
     assert member[15:].all()
     assert not member[:15].any()
@@ -276,10 +287,8 @@ def test_a_newborn_segment_inherits_the_membership_of_its_source():
     centre = centre.at[20].set(centre[4] + 0.01)
     life_s = jnp.full(21, now_s).at[18:].set(0.0)
     displacement = displacement.at[18:].set(0.0)
-    area = jnp.full(21, 16.0)
-    after, bodies = stepped(
-        stage, state, evidence, centre, area, SIZE_M, life_s, displacement, source, frames[29][2], now_s
-    )  # fmt: skip
+    now = segments(centre, displacement, life_s, source=source)
+    after, bodies = stepped(stage, state, evidence, now, frames[29][2], now_s)
     assert float(bodies.log_odds[0, 20]) > 0
     assert float(after.membership[0, 20]) > 1.0
     assert abs(float(after.membership[0, 19])) < 0.5
@@ -288,7 +297,6 @@ def test_a_newborn_segment_inherits_the_membership_of_its_source():
 def test_gradients_reach_evidence_motion_and_parameters():
     stage = CarryingBody()
     frames = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scene(12))
-    area, source = jnp.full(21, 16.0), jnp.full(21, -2, jnp.int32)
 
     def total(learned):
         stage, evidence, scale = learned
@@ -296,9 +304,7 @@ def test_gradients_reach_evidence_motion_and_parameters():
         def step(carry, frame):
             state, last_s, _ = carry
             centre, displacement, now_s = frame
-            state, bodies = stage.step(
-                state, evidence, centre, area, SIZE_M, jnp.full(21, now_s), scale * displacement, source, last_s, now_s
-            )
+            state, bodies = stage.step(state, evidence, segments(centre, scale * displacement, now_s), last_s, now_s)
             return (state, now_s, jnp.sum(jax.nn.sigmoid(bodies.log_odds))), None
 
         (_, _, value), _ = jax.lax.scan(step, (stage.init(1, 21), jnp.zeros(()), jnp.zeros(())), frames)

@@ -77,10 +77,9 @@ def test_a_swinging_leg_belongs_to_the_walker_and_what_stays_behind_does_not(apa
     state, bodies = body.init(1, NUM), None
     step = eqx.filter_jit(body.step)
     frames = list(walker(apart=apart))
-    for (centre, _, now_s), (travel, _) in zip(frames, travelled(TravellingTogether(), frames), strict=True):
-        state, bodies = step(
-            state, evidence, centre, AREA, jnp.full(NUM, 0.1), travel.life_s, travel.displacement_m, travel.source, last_s, now_s
-        )  # fmt: skip
+    for (_, _, now_s), (travel, _) in zip(frames, travelled(TravellingTogether(), frames), strict=True):
+        now = eqx.tree_at(lambda one: one.size_m, travel, jnp.full(NUM, 0.1))
+        state, bodies = step(state, evidence, now, last_s, now_s)
         last_s = now_s
     member = np.asarray(bodies.log_odds)[0] > 0
     assert member[1:13].all()

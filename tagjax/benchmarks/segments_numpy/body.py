@@ -93,6 +93,7 @@ class Body:
         self.past = Past(num_segments, max(settings.speed_s, *self.lags_s))
         self.membership = np.zeros((num_tags, num_segments), np.float32)
         self.fastest_m_s = np.zeros(num_segments, np.float32)
+        self.age_s = np.float32(0)
 
     def step(
         self, evidence: Float[np.ndarray, "tag segment"], found: Segments, since_s: np.float32, now_s: np.float32
@@ -110,7 +111,9 @@ class Body:
         before_m_s = self.fastest_m_s.copy()
         before_m_s[new] = np.where(source > 0, self.fastest_m_s[np.maximum(source, 0)], np.float32(0))
         before_m_s[0] = 0
-        self.fastest_m_s = np.maximum(speed_m_s, keep * before_m_s)
+        self.age_s = np.float32(self.age_s + (now_s - since_s))
+        uncovered = (found.life_s < s.young_s) & (found.front < 0.5) & (self.age_s > s.young_s)
+        self.fastest_m_s = np.where(uncovered, np.float32(0), np.maximum(speed_m_s, keep * before_m_s))
 
         rank = self.fastest_m_s + np.float32(0.1) * np.maximum(self.membership.max(axis=0, initial=0), 0)
         active = top(np.where(found.exists, rank, -np.inf), s.num_active)

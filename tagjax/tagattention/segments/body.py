@@ -11,13 +11,15 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ...core.constrained import Positive
 from ...core.numerics import safe_divide, safe_norm, squared_distance
+from ...core.parameters import check_positive
 from .connection import reached, touching
 from .past_motion import PastMotion
 from .rigid import RigidMotion
+from .step import SegmentFrame
 
 _TINY = 1e-9
 _APART = -30.0  # log odds of what is not looked at
@@ -29,6 +31,7 @@ class BodyState(eqx.Module):
     past: PastMotion
     membership: Float[Array, "tag segment"]  # log odds that the segment belongs to the tag's body, remembered
     fastest_m_s: Float[Array, " segment"]  # highest speed of late, remembered
+    age_s: Float[Array, ""]  # time since the first frame
 
 
 class LaterBody(eqx.Module):
@@ -63,6 +66,7 @@ class CarryingBody(eqx.Module):
     num_active: int = eqx.field(static=True)  # segments that are looked at: the fastest, and remembered members
     num_rounds: int = eqx.field(static=True)
     speed_s: float = eqx.field(static=True)  # time over which speeds are measured
+    young_s: float = eqx.field(static=True)  # a younger segment is a place only in front of what has been seen at rest
 
     def __init__(
         self,
@@ -81,6 +85,7 @@ class CarryingBody(eqx.Module):
         num_active: int = 384,
         num_rounds: int = 3,
         speed_s: float = 0.25,
+        young_s: float = 1.5,
     ) -> None:
         """Raises `ValueError` for a value that is not positive."""
         self.rigid = RigidMotion() if rigid is None else rigid
@@ -97,39 +102,33 @@ class CarryingBody(eqx.Module):
         for name, value in (("num_active", num_active), ("num_rounds", num_rounds)):
             if value < 1:
                 raise ValueError(f"{name} is {value}; expected at least 1.")
-        if not speed_s > 0:
-            raise ValueError(f"speed_s is {speed_s}; expected a positive time.")
-        self.num_active, self.num_rounds, self.speed_s = num_active, num_rounds, float(speed_s)
+        check_positive(speed_s=speed_s, young_s=young_s)
+        self.num_active, self.num_rounds = num_active, num_rounds
+        self.speed_s, self.young_s = float(speed_s), float(young_s)
 
     def init(self, num_tags: int, num_segments: int) -> BodyState:
         """The state before the first frame."""
         span_s = max(self.speed_s, *self.rigid.lags_s)
         past = PastMotion.nothing(num_segments, span_s=span_s)
-        return BodyState(past, jnp.zeros((num_tags, num_segments)), jnp.zeros(num_segments))
+        return BodyState(past, jnp.zeros((num_tags, num_segments)), jnp.zeros(num_segments), jnp.zeros(()))
 
     def step(
         self,
         state: BodyState,
         evidence: Float[Array, "tag segment"],
-        centre_m: Float[Array, "segment 3"],
-        area: Float[Array, " segment"],
-        size_m: Float[Array, " segment"],
-        life_s: Float[Array, " segment"],
-        displacement_m: Float[Array, "segment 3"],
-        newborn_source: Int[Array, " segment"],
+        found: SegmentFrame,
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
         later: LaterBody | None = None,
     ) -> tuple[BodyState, Bodies]:
         """The state after the frame at `now_s`, and each tag's body.
 
-        `evidence` is that of the reads for a tag at a segment against one at rest, nats; `area` in pixels, 0 for a slot
-        without segment; `size_m` as in `SegmentFrame`; slot 0 is the static background. `newborn_source` is -2 for a segment that is not newborn, else
-        the slot it comes from, or -1. Displacement and life of a newborn segment go on from those of the slot it comes from,
-        as those of `Travel` do. What is remembered of `later` frames counts as what is remembered of earlier ones does, and is
-        not carried on.
+        `evidence` is that of the reads for a tag at a segment against one at rest, nats. Displacement and life of a new
+        segment go on from those of the slot it comes from, as `TravellingTogether` has them. What is remembered of `later` frames counts
+        as what is remembered of earlier ones does, and is not carried on.
         """
-        num_segments = area.shape[0]
+        centre_m, area, life_s, displacement_m = found.centre_m, found.area, found.life_s, found.displacement_m
+        num_segments, newborn_source = area.shape[0], found.source
         newborn = newborn_source > -2
         inherited = jnp.where((newborn_source > 0)[None], state.membership[:, jnp.maximum(newborn_source, 0)], 0.0)
         membership = jnp.where(newborn[None], inherited, state.membership)
@@ -141,10 +140,13 @@ class CarryingBody(eqx.Module):
         keep = jnp.exp(-(now_s - since_s) / self.memory_s.value)
         source = jnp.where(newborn, newborn_source, jnp.arange(num_segments, dtype=newborn_source.dtype))
         before_m_s = jnp.where(source > 0, state.fastest_m_s[jnp.maximum(source, 0)], 0.0)
-        own_m_s = fastest_m_s = jnp.maximum(speed_m_s, keep * before_m_s)
+        age_s = state.age_s + (now_s - since_s)
+        # Before that, nothing has been seen at rest for long.
+        uncovered = (life_s < self.young_s) & (found.front < 0.5) & (age_s > self.young_s)
+        own_m_s = fastest_m_s = jnp.where(uncovered, 0.0, jnp.maximum(speed_m_s, keep * before_m_s))
         memories = [membership]
         if later is not None:
-            fastest_m_s = jnp.maximum(own_m_s, later.fastest_m_s)
+            fastest_m_s = jnp.where(uncovered, 0.0, jnp.maximum(own_m_s, later.fastest_m_s))
             memories.append(later.membership)
         exists = (area > 0) & (jnp.arange(num_segments) > 0)
         rank = jnp.where(exists, fastest_m_s + 0.1 * jnp.max(sum(memories), axis=0, initial=0.0), -jnp.inf)
@@ -153,7 +155,7 @@ class CarryingBody(eqx.Module):
         centre, size = centre_m[active], jnp.where(there, area[active], 0.0)
 
         close = squared_distance(centre, centre) < jnp.square(self.neighbour_m.value)
-        touch = touching(centre, size_m[active])
+        touch = touching(centre, found.size_m[active])
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
 
@@ -210,7 +212,7 @@ class CarryingBody(eqx.Module):
         shape = membership.shape
         # Segments that are not looked at forget as well.
         membership = (keep * membership).at[:, active].set(jnp.where(there[None], remembered, 0.0))
-        return BodyState(past, membership, own_m_s), Bodies(
+        return BodyState(past, membership, own_m_s, age_s), Bodies(
             log_odds=jnp.full(shape, _APART).at[:, active].set(jnp.where(there[None], log_odds, _APART)),
             place=jnp.zeros(shape).at[:, active].set(jnp.where(there[None], place, 0.0)),
             speed_m_s=speed_m_s,

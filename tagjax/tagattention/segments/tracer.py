@@ -312,10 +312,7 @@ class TagAttention(AbstractSmoother):
             membership = cut_segments(log_likelihood, moving)
             return None, membership, membership * found.area[None]
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
-        state, bodies = self.body.step(
-            state, evidence, found.centre_m, found.area, found.size_m, found.life_s, found.displacement_m, found.source, since_s, now_s,
-            later,
-        )  # fmt: skip
+        state, bodies = self.body.step(state, evidence, found, since_s, now_s, later)
         membership = jax.nn.sigmoid(bodies.log_odds)
         if self.whole is not None:
             moved = state.past.since(self.whole.lag_s, found.displacement_m, found.life_s, now_s)
