@@ -245,17 +245,27 @@ def test_what_moves_alike_belongs_to_the_body_where_it_is_connected(size_m: floa
 
 
 @pytest.mark.parametrize(
-    ("life_s", "front", "age_s", "is_place"),
-    [(0.5, 0.0, 9.0, False), (0.5, 1.0, 9.0, True), (1.6, 0.0, 9.0, True), (0.5, 0.0, 1.0, True)],
-    ids=["uncovered", "in front", "old", "nothing seen at rest yet"],
+    ("life_s", "speed", "front", "age_s", "is_place"),
+    [
+        (0.4, 0.4, 0.0, 9.0, False),
+        (0.4, 0.4, 1.0, 9.0, True),
+        (9.0, 0.1, 0.0, 9.0, True),
+        (9.0, 0.4, 0.0, 9.0, False),
+        (9.0, 0.4, 1.0, 9.0, True),
+        (0.4, 0.4, 0.0, 0.45, True),
+    ],
+    ids=["uncovered", "young, in front", "old, slow", "a shadow", "in front", "nothing seen at rest yet"],
 )
-def test_what_has_just_come_into_view_behind_is_no_place(life_s: float, front: float, age_s: float, is_place: bool):
+def test_what_comes_into_view_or_slides_behind_is_no_place(
+    life_s: float, speed: float, front: float, age_s: float, is_place: bool
+):
     stage, evidence = CarryingBody(), jnp.zeros((1, 21)).at[0, 15:].set(60.0).at[0, 1:9].set(30.0)
     state, bodies, last_s = stage.init(1, 21), None, jnp.zeros(())
-    state = eqx.tree_at(lambda one: one.age_s, state, jnp.asarray(age_s - 1.0))
+    state = eqx.tree_at(lambda one: one.age_s, state, jnp.asarray(age_s - 29 / 30))
     for centre, displacement, now_s in scene():
+        displacement = displacement.at[15:].multiply(speed / 0.4)
         lives = jnp.full(21, 9.0).at[15:].set(life_s)
-        now = segments(centre, displacement, lives, front=jnp.zeros(21).at[15:].set(front))
+        now = segments(centre, displacement, lives, front=jnp.ones(21).at[15:].set(front))
         state, bodies = stepped(stage, state, evidence, now, last_s, now_s)
         last_s = now_s
     assert bodies is not None

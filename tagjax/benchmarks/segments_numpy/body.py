@@ -112,8 +112,11 @@ class Body:
         before_m_s[new] = np.where(source > 0, self.fastest_m_s[np.maximum(source, 0)], np.float32(0))
         before_m_s[0] = 0
         self.age_s = np.float32(self.age_s + (now_s - since_s))
-        uncovered = (found.life_s < s.young_s) & (found.front < 0.5) & (self.age_s > s.young_s)
-        self.fastest_m_s = np.where(uncovered, np.float32(0), np.maximum(speed_m_s, keep * before_m_s))
+        uncovered = found.life_s < min(s.young_s, self.age_s - original._SEEN_S)
+        lagged_m, _ = self.past.since(self.lags_s[-1], found.displacement_m, found.life_s, now_s)
+        slid = (self.age_s > original._SEEN_S) & (norm(lagged_m) > s.slid_m)
+        behind = (found.front < 0.5) & (uncovered | slid)
+        self.fastest_m_s = np.where(behind, np.float32(0), np.maximum(speed_m_s, keep * before_m_s))
 
         rank = self.fastest_m_s + np.float32(0.1) * np.maximum(self.membership.max(axis=0, initial=0), 0)
         active = top(np.where(found.exists, rank, -np.inf), s.num_active)

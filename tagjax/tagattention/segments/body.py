@@ -23,6 +23,7 @@ from .step import SegmentFrame
 
 _TINY = 1e-9
 _APART = -30.0  # log odds of what is not looked at
+_SEEN_S = 0.5  # after the first frame; before, hardly anything has been seen at rest
 
 
 class BodyState(eqx.Module):
@@ -66,7 +67,10 @@ class CarryingBody(eqx.Module):
     num_active: int = eqx.field(static=True)  # segments that are looked at: the fastest, and remembered members
     num_rounds: int = eqx.field(static=True)
     speed_s: float = eqx.field(static=True)  # time over which speeds are measured
-    young_s: float = eqx.field(static=True)  # a younger segment is a place only in front of what has been seen at rest
+    young_s: float = eqx.field(static=True)  # a younger segment is a place only in front of what has been seen at rest,
+    slid_m: float = eqx.field(
+        static=True
+    )  # and so is one with a larger displacement over the longest of `rigid.lags_s`
 
     def __init__(
         self,
@@ -86,6 +90,7 @@ class CarryingBody(eqx.Module):
         num_rounds: int = 3,
         speed_s: float = 0.25,
         young_s: float = 1.5,
+        slid_m: float = 0.15,
     ) -> None:
         """Raises `ValueError` for a value that is not positive."""
         self.rigid = RigidMotion() if rigid is None else rigid
@@ -102,9 +107,9 @@ class CarryingBody(eqx.Module):
         for name, value in (("num_active", num_active), ("num_rounds", num_rounds)):
             if value < 1:
                 raise ValueError(f"{name} is {value}; expected at least 1.")
-        check_positive(speed_s=speed_s, young_s=young_s)
+        check_positive(speed_s=speed_s, young_s=young_s, slid_m=slid_m)
         self.num_active, self.num_rounds = num_active, num_rounds
-        self.speed_s, self.young_s = float(speed_s), float(young_s)
+        self.speed_s, self.young_s, self.slid_m = float(speed_s), float(young_s), float(slid_m)
 
     def init(self, num_tags: int, num_segments: int) -> BodyState:
         """The state before the first frame."""
@@ -141,12 +146,15 @@ class CarryingBody(eqx.Module):
         source = jnp.where(newborn, newborn_source, jnp.arange(num_segments, dtype=newborn_source.dtype))
         before_m_s = jnp.where(source > 0, state.fastest_m_s[jnp.maximum(source, 0)], 0.0)
         age_s = state.age_s + (now_s - since_s)
-        # Before that, nothing has been seen at rest for long.
-        uncovered = (life_s < self.young_s) & (found.front < 0.5) & (age_s > self.young_s)
-        own_m_s = fastest_m_s = jnp.where(uncovered, 0.0, jnp.maximum(speed_m_s, keep * before_m_s))
+        uncovered = life_s < jnp.minimum(self.young_s, age_s - _SEEN_S)
+        slid = (age_s > _SEEN_S) & (
+            safe_norm(past.since(self.rigid.lags_s[-1], displacement_m, life_s, now_s)[0]) > self.slid_m
+        )
+        behind = (found.front < 0.5) & (uncovered | slid)
+        own_m_s = fastest_m_s = jnp.where(behind, 0.0, jnp.maximum(speed_m_s, keep * before_m_s))
         memories = [membership]
         if later is not None:
-            fastest_m_s = jnp.where(uncovered, 0.0, jnp.maximum(own_m_s, later.fastest_m_s))
+            fastest_m_s = jnp.where(behind, 0.0, jnp.maximum(own_m_s, later.fastest_m_s))
             memories.append(later.membership)
         exists = (area > 0) & (jnp.arange(num_segments) > 0)
         rank = jnp.where(exists, fastest_m_s + 0.1 * jnp.max(sum(memories), axis=0, initial=0.0), -jnp.inf)
