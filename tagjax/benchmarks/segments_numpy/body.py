@@ -113,8 +113,8 @@ class Body:
         before_m_s[0] = 0
         self.age_s = np.float32(self.age_s + (now_s - since_s))
         uncovered = found.life_s < min(s.young_s, self.age_s - original._SEEN_S)
-        lagged_m, _ = self.past.since(self.lags_s[-1], found.displacement_m, found.life_s, now_s)
-        slid = (self.age_s > original._SEEN_S) & (norm(lagged_m) > s.slid_m)
+        lagged = [self.past.since(lag, found.displacement_m, found.life_s, now_s) for lag in self.lags_s]
+        slid = (self.age_s > original._SEEN_S) & (norm(lagged[-1][0]) > s.slid_m)
         behind = (found.front < 0.5) & (uncovered | slid)
         self.fastest_m_s = np.where(behind, np.float32(0), np.maximum(speed_m_s, keep * before_m_s))
 
@@ -128,7 +128,6 @@ class Body:
         self.membership *= keep
         self.membership[:, gone] = 0
         if len(active):
-            lagged = [self.past.since(lag, found.displacement_m, found.life_s, now_s) for lag in self.lags_s]
             moved = np.stack([moved[active] for moved, _ in lagged])
             enough = [
                 elapsed[active] >= np.float32(0.8 * lag) for (_, elapsed), lag in zip(lagged, self.lags_s, strict=True)

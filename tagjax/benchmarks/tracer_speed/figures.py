@@ -11,7 +11,6 @@ import numpy as np
 
 from ...recording import Recording
 from ...recording.store import open_recording
-from ...tracing.tracer import Camera, Frame
 from ..timing import Figure, Timing
 from .live import frame_times_ms, start_times_s, stream_memory_mib
 from .stages import (
@@ -118,20 +117,18 @@ def _parts(settings: TracerSpeedSettings, recording: Recording, seed: int) -> It
 
 
 def _scaling(settings: TracerSpeedSettings, recording: Recording) -> Iterator[Figure]:
-    def prepared(num_tags: int, stride: int) -> tuple[Camera, list[Frame]]:
+    by_tags = [(num_tags, settings.stride) for num_tags in (1, _FEW, 16, _MANY)]
+    by_pixels = [(_FEW, stride) for stride in (2 * settings.stride, max(1, settings.stride // 2))]
+    cost: dict[str, float] = {}
+    for num_tags, stride in dict.fromkeys([*by_tags, *by_pixels]):
         swing = Swing.of(recording, num_tags=num_tags)
-        return prepared_frames(swing, settings.part_frames, stride=stride, flow=settings.flow)
-
-    for num_tags in (1, _FEW, 16, _MANY):
-        times = step_times_ms(*prepared(num_tags, settings.stride))
-        yield Figure(f"step without flow, boxes only, tags: {num_tags}", float(np.median(times)), "ms")
-    for stride in (2 * settings.stride, settings.stride, max(1, settings.stride // 2)):
-        camera, frames = prepared(_FEW, stride)
+        camera, frames = prepared_frames(swing, settings.part_frames, stride=stride, flow=settings.flow)
         height, width, _ = camera.rays.shape
         times = step_times_ms(camera, frames)
-        yield Figure(f"step without flow, {_FEW} tags, pixels: {width}x{height}", float(np.median(times)), "ms")
-    camera, frames = prepared(_FEW, settings.stride)
-    cost, limits = step_cost(camera, frames[0]), machine_limits()
+        yield Figure(f"step without flow, boxes only, {num_tags} tags, {width}x{height}", float(np.median(times)), "ms")
+        if (num_tags, stride) == (_FEW, settings.stride):
+            cost = step_cost(camera, frames[0])
+    limits = machine_limits()
     yield Figure("this machine copies", 1e-9 * limits["bytes_per_s"], "GB/s")
     yield Figure("this machine multiplies matrices", 1e-9 * limits["flops_per_s"], "GFLOP/s")
     for name, what in (("given_bytes", "inputs and outputs"), ("accessed_bytes", "all operations")):

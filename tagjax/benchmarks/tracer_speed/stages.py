@@ -26,6 +26,7 @@ from ...tracing.clips import MAX_ARRIVALS, choose_antennas, subsampled_depth
 from ...tracing.tracer import Camera, Frame
 from ..segments_numpy import NumpyTracer
 from ..segments_numpy.reads import Dwells
+from ..timing import median_ms
 from .live import masks
 from .swing import Shot, Swing
 
@@ -167,23 +168,13 @@ def step_cost(camera: Camera, frame: Frame) -> dict[str, float]:
 
 
 def machine_limits() -> dict[str, float]:
-    """The highest rates that this machine shows: bytes/s read and written by a copy, and FLOP/s of a product of matrices."""
+    """What this machine reaches: bytes/s read and written by a copy, and FLOP/s of a product of matrices."""
     source = np.ones(2**25, np.float32)
     target, matrix = np.empty_like(source), jnp.ones((2048, 2048))
     product = jax.jit(lambda one: one @ one)
-    jax.block_until_ready(product(matrix))
-
-    def shortest_s(call: Callable[[], Any]) -> float:
-        times = []
-        for _ in range(7):
-            begun = time.perf_counter()
-            jax.block_until_ready(call())
-            times.append(time.perf_counter() - begun)
-        return min(times)
-
     return {
-        "bytes_per_s": 2 * source.nbytes / shortest_s(lambda: np.copyto(target, source)),
-        "flops_per_s": 2 * 2048**3 / shortest_s(lambda: product(matrix)),
+        "bytes_per_s": 2e3 * source.nbytes / median_ms(lambda: np.copyto(target, source), 7),
+        "flops_per_s": 2e3 * 2048**3 / median_ms(lambda: product(matrix), 7),
     }
 
 
