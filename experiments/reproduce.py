@@ -1,6 +1,7 @@
 """Make a table of results from its recipe: measure it, write it as JSON and into its pages.
 
 python -m experiments.reproduce table=suites               # interrupted, it resumes when it is started again
+python -m experiments.reproduce table=suites confirm=1     # up to date again after a change that alters no score
 python -m experiments.reproduce table=suites render=true   # the Markdown again, from the JSON
 python -m experiments.reproduce check=true                 # which tables are stale, and why
 """
@@ -70,6 +71,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
             recordings=Path(values["recordings_dir"]),
             finished=Path(values["finished_dir"]),
             workers=values["workers"],
+            confirm=values["confirm"],
             on_progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
         )
     console.print(rendered(table))

@@ -343,9 +343,9 @@ def test_a_recorded_value_has_one_whole_source(source: dict[str, str]):
 # Measuring
 
 
-def _result() -> RecordingResult:
+def _result(name: str = "one") -> RecordingResult:
     """One recording's scores, of two tags over four frames."""
-    truth = synthetic.recording(num_frames=4)
+    truth = dataclasses.replace(synthetic.recording(num_frames=4), name=name)
     frames = frame_scores(
         [0.2, 0.6, 0.7, 0.8],
         cle_px=[5.0, np.nan, 3.0, 3.0],
@@ -363,7 +363,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
     def trace(self: Tracing, path: Path) -> RecordingResult:
         found.append(path)
-        return _result()
+        return _result(path.stem)
 
     monkeypatch.setattr(Tracing, "trace", trace)
     monkeypatch.setattr(
@@ -391,6 +391,60 @@ def test_scores_are_kept_as_sums(tmp_path: Path, traced: list[Path]):
     assert found[0].sums["cle_px"] == pytest.approx((12.0, 4))
     assert found[0].sums["identification"] == pytest.approx((4.0, 6))
     assert found[0].sums["locked"] == (2.0, 2)
+
+
+def _whole_table(folder: Path, traced: list[Path]) -> dict[str, list[RecordingScores]]:
+    """The table's scores by an older revision."""
+    scores = measure(_recipe(), _inputs(folder, revision="a" * 40))
+    traced.clear()
+    return {job.name: found for job, found in scores.items()}
+
+
+CHANGED_CODE = {"code/one.py": "3" * 40}
+
+
+def test_confirming_takes_over_what_scores_the_same(tmp_path: Path, traced: list[Path]):
+    before = _whole_table(tmp_path, traced)
+    inputs = _inputs(tmp_path, code=CHANGED_CODE, revision="b" * 40)
+    (found,) = measure(_recipe(), inputs, before=before, confirm=1).values()
+    assert len(traced) == 1
+    assert [one.revision[:1] for one in found if one.revision] == ["b", "a", "a", "a"]
+    assert [one.sums for one in found] == [one.sums for one in next(iter(before.values()))]
+
+
+@pytest.mark.parametrize("changed", ["iou", "locked", "num_frames"])
+def test_confirming_traces_all_recordings_once_one_scores_otherwise(tmp_path: Path, traced: list[Path], changed: str):
+    ((job, scores),) = _whole_table(tmp_path, traced).items()
+    first = scores[0]
+    if changed == "num_frames":
+        other = dataclasses.replace(first, num_frames=first.num_frames + 1)
+    else:
+        total, count = first.sums[changed]
+        other = dataclasses.replace(first, sums={**first.sums, changed: (total + 0.01 * count, count)})
+    measure(_recipe(), _inputs(tmp_path, code=CHANGED_CODE), before={job: [other, *scores[1:]]}, confirm=1)
+    assert len(traced) == 4
+
+
+def test_confirming_traces_all_recordings_of_a_new_row(tmp_path: Path, traced: list[Path]):
+    measure(_recipe(), _inputs(tmp_path), before={}, confirm=1)
+    assert len(traced) == 4
+
+
+def test_confirming_needs_a_recording(tmp_path: Path):
+    with pytest.raises(ConfigError, match="confirm is 0; expected 1 or more"):
+        measure(_recipe(), _inputs(tmp_path), confirm=0)
+
+
+def test_a_table_says_which_recordings_were_traced_before(root: Path):
+    recipe = _recipe()
+    table = _made(recipe, root)
+    assert "were traced at" not in rendered(table)
+    for scores in table["recordings"].values():
+        scores[0]["revision"] = "c" * 40
+    assert (
+        "1 of 2 recordings were traced at `cccccccccc`; others of each of their rows score the same now."
+        in rendered(table)
+    )
 
 
 def test_an_interrupted_measurement_loses_one_recording_at_most(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -119,7 +120,15 @@ def _made_by(table: Mapping[str, Any]) -> str:
     commit = "unknown" if revision["commit"] is None else f"`{revision['commit'][:10]}`"
     changed = " with uncommitted changes" if revision["dirty"] else ""
     on = f"{machine['cores']} cores ({machine['processor']}), jax {machine['jax']}"
-    return f"Made by `{table['command']}`, revision {commit}{changed}, {table['date_utc'][:10]}, on {on}."
+    made = f"Made by `{table['command']}`, revision {commit}{changed}, {table['date_utc'][:10]}, on {on}."
+    traced = Counter(one.get("revision") for scores in table["recordings"].values() for one in scores)
+    if older := sorted((found, num) for found, num in traced.items() if found not in (None, revision["commit"])):
+        num, whole = sum(num for _, num in older), sum(traced.values())
+        commits = ", ".join(f"`{found[:10]}`" for found, _ in older)
+        made += (
+            f" {num} of {whole} recordings were traced at {commits}; others of each of their rows score the same now."
+        )
+    return made
 
 
 def _recorded_notes(table: Mapping[str, Any]) -> list[str]:

@@ -22,7 +22,7 @@ from ...tagattention.tracer_settings import learned_tracer, make_tracer, settled
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
 from ...training.evaluate import parameters
-from .recipe import Job, Recipe
+from .recipe import SCORES, Job, Recipe
 from .scores import RecordingScores
 
 HOST_TRACERS: Mapping[str, Callable[[Mapping[str, Any]], AbstractHostTracer]] = {
@@ -44,17 +44,26 @@ class Inputs:
     finished: Path  # folder of the scores of traced recordings, by the hash of what determines them
     code: Mapping[str, str]  # blob ids of the files that determine the scores
     workers: int = 1  # processes that simulate
+    revision: str | None = None  # Git's commit of that code
 
 
 def measure(
-    recipe: Recipe, inputs: Inputs, *, on_progress: OnProgress | None = None
+    recipe: Recipe,
+    inputs: Inputs,
+    *,
+    before: Mapping[str, Sequence[RecordingScores]] | None = None,
+    confirm: int | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[Job, list[RecordingScores]]:
     """The scores of every job of a recipe, one element per recording.
 
     Recordings that were traced before, by the same code with the same settings, are not traced again; an interruption
-    loses only the recording in progress. Raises `ConfigError` for a suite or tracer that is not in `inputs`, and for a
-    split without recordings.
+    loses only the recording in progress. With `confirm`, the first so many recordings of each job are traced; where they
+    score as in `before` (by the job's name), the scores of the others are taken from there. Raises `ConfigError` for a
+    suite or tracer that is not in `inputs`, for a split without recordings, and for `confirm` below 1.
     """
+    if confirm is not None and confirm < 1:
+        raise ConfigError(f"confirm is {confirm}; expected 1 or more recordings, or null to trace every one.")
     report = on_progress or (lambda what, done, total: None)
     jobs = recipe.jobs()
     tracings = {job: _tracing(recipe, inputs, job) for job in jobs}  # wrong settings raise before the work starts
@@ -62,11 +71,19 @@ def measure(
     total = sum(len(items[_recordings_key(job)]) for job in jobs)
     numbers = itertools.count()
     scores: dict[Job, list[RecordingScores]] = {job: [] for job in jobs}
+    earlier = {job: {one.name: one for one in (before or {}).get(job.name, ())} for job in jobs}
     for draw in items:
-        for item in items[draw]:
+        for position, item in enumerate(items[draw]):
             for job in (job for job in jobs if _recordings_key(job) == draw):
                 report(f"{item.name}: {job.system}", next(numbers), total)
-                scores[job].append(tracings[job].scores(item, inputs))
+                known = earlier[job].get(item.name)
+                if known is None or confirm is None or position < confirm:
+                    found = tracings[job].scores(item, inputs)
+                    if known is None or not found.same_as(known, SCORES):
+                        earlier[job] = {}  # the code scores otherwise than before: nothing of this job is taken over
+                else:
+                    found = known
+                scores[job].append(found)
     report("measured", total, total)
     return scores
 
@@ -88,7 +105,7 @@ class Tracing:
         path = inputs.finished / f"{name}.json"
         kept = _stored(path, follows_from)
         if kept is None:
-            kept = RecordingScores.of(self.trace(item.path(inputs.recordings)))
+            kept = RecordingScores.of(self.trace(item.path(inputs.recordings)), inputs.revision)
             write_json(path, {"follows_from": follows_from, "scores": dataclasses.asdict(kept)})
         return kept
 
@@ -194,8 +211,6 @@ def _stored(path: Path, follows_from: Mapping[str, Any]) -> RecordingScores | No
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["follows_from"] != follows_from:
             return None
-        scores = content["scores"]
-        sums = {name: (float(total), int(count)) for name, (total, count) in scores["sums"].items()}
-        return RecordingScores(scores["name"], int(scores["num_tags"]), int(scores["num_frames"]), sums)
+        return RecordingScores.from_json(content["scores"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

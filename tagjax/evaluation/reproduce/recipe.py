@@ -22,8 +22,11 @@ Split = Literal["train", "validation", "test"]
 COUNTS = ("num_recordings", "num_tags", "num_frames")
 """Measures that count the items over which a cell's scores are averaged."""
 
-MEASURES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "p_fa", *COUNTS)
-"""Measures that a column can show: scores of `tagjax.metrics.tags.Scores`, `locked` (of all tags), and counts."""
+SCORES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "p_fa")
+"""Means that a column can show: scores of `tagjax.metrics.tags.Scores`, and `locked` (of all tags)."""
+
+MEASURES = (*SCORES, *COUNTS)
+"""All that a column can show."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -66,6 +66,16 @@ def filled(begun: Mapping[str, Any], recipe: Recipe, scores: Mapping[Job, Sequen
     return {**begun, "columns": columns, "rows": rows, "recordings": by_job}
 
 
+def scores_by_recording(table: Mapping[str, Any] | None) -> dict[str, list[RecordingScores]]:
+    """The scores of each recording by the name of its job; none where there is no table."""
+    if table is None:
+        return {}
+    commit = table["revision"]["commit"]
+    return {
+        job: [RecordingScores.from_json(one, commit) for one in scores] for job, scores in table["recordings"].items()
+    }
+
+
 def _cell(
     recipe: Recipe, row: Row, name: str, column: Column, scores: Mapping[Job, Sequence[RecordingScores]]
 ) -> dict[str, Any] | None:
