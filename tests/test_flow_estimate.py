@@ -32,6 +32,7 @@ from tagjax.flow.estimates import NetworkFlow, consistency, estimate, flow_along
 from tagjax.flow.images import check_images, to_uint8
 from tagjax.flow.loss_terms import occluded
 from tagjax.flow.network import AbstractFlowNetwork
+from tagjax.flow.opencv import DISFlow
 from tagjax.flow.pyramid import PyramidFlow
 from tagjax.flow.registry import CLASSICAL, VARIANTS, flow_key, make_flow
 from tagjax.flow.stationary import zero_stationary
@@ -682,3 +683,16 @@ def test_documented_flow_of_two_pictures_runs(tmp_path: Path, monkeypatch: pytes
         cv2.imwrite(str(tmp_path / name), picture)
     monkeypatch.chdir(tmp_path)
     exec(code, {})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"refinements": -1}, "refinements is -1; expected at least 0"),
+        ({"patch_stride": 9}, "patch_stride is 9; expected 1 to 8 pixels"),
+        ({"preset": "slow"}, "Unknown DIS preset 'slow'; expected one of ultrafast, fast, medium"),
+    ],
+)
+def test_dis_refuses_impossible_settings(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DISFlow(**settings)

@@ -22,7 +22,6 @@ from jaxtyping import Array, Int
 from ..core.camera import Intrinsics, working_stride
 from ..core.geometry import pixel_rays, range_to_depth
 from ..radio.arrivals import Arrivals
-from ..radio.reads import PhaseReads, RadioWindow
 from ..recording import RecordingWarning, TagReads
 from .arrivals import frame_arrivals
 from .clips import MAX_ARRIVALS, subsampled_depth
@@ -237,19 +236,8 @@ class _Sensed(NamedTuple):
     present: Any
 
     def frame(self, num_antennas: int) -> Frame:
-        """The tracer's input; it has no window of phases, which nothing that runs live uses."""
-        rows = self.present.shape[0], num_antennas
-        none = jnp.zeros((*rows, 1))
-        return Frame(
-            time_s=self.time_s,
-            depth_m=self.depth_m,
-            backward_px=self.backward_px,
-            forward_px=jnp.zeros_like(self.backward_px),
-            radio=RadioWindow(jnp.zeros((*rows, 2)), jnp.full((*rows, 2), jnp.inf)),
-            reads=PhaseReads(none, none, none, none, none.astype(jnp.int32), none > 0),
-            arrivals=self.arrivals,
-            present=self.present,
-        )
+        """The tracer's input."""
+        return Frame.of_arrivals(self.time_s, self.depth_m, self.backward_px, self.arrivals, self.present, num_antennas)
 
 
 @dataclasses.dataclass(frozen=True)

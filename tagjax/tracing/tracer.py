@@ -75,6 +75,29 @@ class Frame(eqx.Module):
     backward_message: Any | None = None  # offline smoothing only: of `AbstractSmoother.backward_step`
     objects: Int[Array, "*time height width"] | None = None  # error budgets only: given objects, 0 = none
 
+    @staticmethod
+    def of_arrivals(
+        time_s: Float[Array, ""],
+        depth_m: Float[Array, "height width"],
+        backward_px: Float[Array, "height width 2"],
+        arrivals: Arrivals,
+        present: Bool[Array, " tag"],
+        num_antennas: int,
+    ) -> Frame:
+        """A frame for tracers that use each read as it arrives: no forward flow, and an empty window of reads."""
+        rows = present.shape[0], num_antennas
+        none = jnp.zeros((*rows, 1))
+        return Frame(
+            time_s=time_s,
+            depth_m=depth_m,
+            backward_px=backward_px,
+            forward_px=jnp.zeros_like(backward_px),
+            radio=RadioWindow(jnp.zeros((*rows, 2)), jnp.full((*rows, 2), jnp.inf)),
+            reads=PhaseReads(none, none, none, none, none.astype(jnp.int32), none > 0),
+            arrivals=arrivals,
+            present=present,
+        )
+
 
 class Trace(eqx.Module):
     """The output of a tracer at one frame, for every tag; `trace` stacks it over time."""

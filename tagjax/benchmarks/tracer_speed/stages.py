@@ -16,7 +16,6 @@ from ...core.geometry import pixel_rays
 from ...flow.registry import make_flow
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
-from ...radio.reads import PhaseReads, RadioWindow
 from ...tagattention.segments import DwellEvidence, TagAttention
 from ...tagattention.segments.cells import NOT_NEW
 from ...tagattention.segments.dwell import DwellState
@@ -84,10 +83,7 @@ def prepared_frames(swing: Swing, num_frames: int, *, stride: int, flow: str) ->
     antennas = choose_antennas(recording, recording.reads.epcs)
     rays = jnp.asarray(pixel_rays(swing.intrinsics.scaled(stride)))
     camera = Camera(rays, jnp.asarray(np.asarray(recording.antennas_m, np.float32)[np.array(antennas) - 1]))
-    rows, no_flow = (len(epcs), len(antennas)), jnp.zeros((*rays.shape[:2], 2))
-    no_radio = RadioWindow(jnp.zeros((*rows, 2)), jnp.full((*rows, 2), jnp.inf))
-    none = jnp.zeros((*rows, 1))
-    no_reads = PhaseReads(none, none, none, none, none.astype(jnp.int32), none > 0)
+    no_flow, present = jnp.zeros((*rays.shape[:2], 2)), jnp.ones(len(epcs), bool)
     last: Shot | None = None
     for shot in swing.shots(num_frames):
         backward_px = no_flow
@@ -97,15 +93,13 @@ def prepared_frames(swing: Swing, num_frames: int, *, stride: int, flow: str) ->
         stamp = np.array([shot.time_ns])
         arrivals, _ = frame_arrivals(shot.reads, epcs, antennas, stamp, 0, MAX_ARRIVALS, since_ns=since_ns)
         frames.append(
-            Frame(
-                time_s=jnp.asarray(shot.time_ns * 1e-9, jnp.float32),
-                depth_m=jnp.asarray(subsampled_depth(shot.depth_m[None], stride)[0]),
-                backward_px=jnp.asarray(backward_px),
-                forward_px=no_flow,
-                radio=no_radio,
-                reads=no_reads,
-                arrivals=jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), arrivals),
-                present=jnp.ones(len(epcs), bool),
+            Frame.of_arrivals(
+                jnp.asarray(shot.time_ns * 1e-9, jnp.float32),
+                jnp.asarray(subsampled_depth(shot.depth_m[None], stride)[0]),
+                jnp.asarray(backward_px),
+                jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), arrivals),
+                present,
+                len(antennas),
             )
         )
         last = shot

@@ -11,7 +11,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ...core.constrained import Positive
 from ...core.numerics import safe_divide, safe_norm, squared_distance
@@ -67,10 +67,10 @@ class CarryingBody(eqx.Module):
     num_active: int = eqx.field(static=True)  # segments that are looked at: the fastest, and remembered members
     num_rounds: int = eqx.field(static=True)
     speed_s: float = eqx.field(static=True)  # time over which speeds are measured
-    young_s: float = eqx.field(static=True)  # a younger segment is a place only in front of what has been seen at rest,
-    slid_m: float = eqx.field(
-        static=True
-    )  # and so is one with a larger displacement over the longest of `rigid.lags_s`
+    # A segment that is younger, or displaced by more over the longest of `rigid.lags_s`, is a place only in front of what
+    # has been seen at rest.
+    young_s: float = eqx.field(static=True)
+    slid_m: float = eqx.field(static=True)
 
     def __init__(
         self,
@@ -146,10 +146,10 @@ class CarryingBody(eqx.Module):
         source = jnp.where(newborn, newborn_source, jnp.arange(num_segments, dtype=newborn_source.dtype))
         before_m_s = jnp.where(source > 0, state.fastest_m_s[jnp.maximum(source, 0)], 0.0)
         age_s = state.age_s + (now_s - since_s)
+        lags_s = jnp.array(self.rigid.lags_s, centre_m.dtype)
+        lagged_m, elapsed_s = jax.vmap(lambda lag_s: past.since(lag_s, displacement_m, life_s, now_s))(lags_s)
         uncovered = life_s < jnp.minimum(self.young_s, age_s - _SEEN_S)
-        slid = (age_s > _SEEN_S) & (
-            safe_norm(past.since(self.rigid.lags_s[-1], displacement_m, life_s, now_s)[0]) > self.slid_m
-        )
+        slid = (age_s > _SEEN_S) & (safe_norm(lagged_m[-1]) > self.slid_m)
         behind = (found.front < 0.5) & (uncovered | slid)
         own_m_s = fastest_m_s = jnp.where(behind, 0.0, jnp.maximum(speed_m_s, keep * before_m_s))
         memories = [membership]
@@ -167,11 +167,8 @@ class CarryingBody(eqx.Module):
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
 
-        def before(lag_s: Float[Array, ""]) -> tuple[Float[Array, "active 3"], Bool[Array, " active"]]:
-            moved_m, elapsed_s = past.since(lag_s, displacement_m, life_s, now_s)
-            return centre - moved_m[active], (elapsed_s[active] >= 0.8 * lag_s) & there
-
-        before_m, known = jax.vmap(before)(jnp.array(self.rigid.lags_s, centre.dtype))
+        before_m = centre - lagged_m[:, active]
+        known = (elapsed_s[:, active] >= 0.8 * lags_s[:, None]) & there
         width = 0.3 * self.moving_m_s.value
         moving = jax.nn.log_sigmoid((fastest_m_s[active] - self.moving_m_s.value) / width)
 

@@ -83,11 +83,11 @@ class SegmentTracker(eqx.Module):
         if moves_later is not None:
             view = view.without(moves_later)
         seen = jnp.any(valid)
-        given = jax.lax.stop_gradient((camera.rays, depth_m, backward_px, view, dt_s, focal))
 
         def looked() -> tuple[SegmentState, Labelling]:
-            rays, depth_m, backward_px, view, dt_s, focal = given
-            return self.segmenter.step(state.segments, rays, depth_m, valid, backward_px, view, dt_s, focal, objects)
+            return self.segmenter.step(
+                state.segments, camera.rays, depth_m, valid, backward_px, view, dt_s, focal, objects
+            )
 
         nothing = Labelling.nothing(depth_m.shape[0], depth_m.shape[1], self.segmenter.num_segments)
         segments, found = jax.lax.cond(seen, looked, lambda: (state.segments, nothing))
