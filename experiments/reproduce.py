@@ -44,9 +44,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from tagjax.evaluation.reproduce.status import status
 
     if not (ROOT / "docs").is_dir():
-        raise ValueError(
-            f"found no folder docs in {ROOT}; expected a clone of the repository, whose pages can be written."
-        )
+        raise ValueError(f"found no folder docs in {ROOT}; expected a clone of the repository, with its pages.")
     chosen, console = values.get("table"), Console(soft_wrap=True, highlight=False, markup=False)
     recipes = [from_mapping(Recipe, one, where="table") for one in ([chosen] if chosen else recipe_settings())]
     if values["check"]:

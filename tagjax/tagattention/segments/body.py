@@ -167,8 +167,8 @@ class CarryingBody(eqx.Module):
         near = jnp.where(close, size[None], 0.0)
         near = safe_divide(near, jnp.broadcast_to(jnp.sum(near, axis=1, keepdims=True), near.shape))
 
-        before_m = centre - lagged_m[:, active]
-        known = (elapsed_s[:, active] >= 0.8 * lags_s[:, None]) & there
+        before_m = centre[None] - lagged_m[:, active]
+        known = (elapsed_s[:, active] >= 0.8 * lags_s[:, None]) & there[None]
         width = 0.3 * self.moving_m_s.value
         moving = jax.nn.log_sigmoid((fastest_m_s[active] - self.moving_m_s.value) / width)
 
