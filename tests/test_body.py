@@ -126,6 +126,18 @@ def test_a_lag_counts_only_for_segments_that_were_there():
     np.testing.assert_allclose(ratio, [4.0, 4.0, 2.0, 4.0, 0.0], atol=1e-5)
 
 
+def test_the_log_ratio_has_a_finite_gradient_where_the_body_was_not_there_yet():
+    before = jnp.asarray(cloud(6, 5)[0], jnp.float32)
+    known = jnp.array([[False, False, True, True, True]])
+    weight = jnp.array([1.0, 1.0, 1e-25, 1e-25, 1e-25])
+    rigid = RigidMotion(lags_s=(0.2,))
+    gradients = jax.grad(lambda w, x: jnp.sum(rigid.log_ratio(w, before[None], known, x)), (0, 1))(weight, before + 0.1)
+    assert all(np.isfinite(gradient).all() for gradient in gradients)
+    ratio = log_ratio(rigid, weight, before[None], known, before + 0.1)
+    nothing = log_ratio(rigid, jnp.zeros(5), before[None], known, before + 0.1)
+    np.testing.assert_array_equal(ratio, nothing)
+
+
 @pytest.mark.parametrize("rate_hz", [7.0, 10.0, 30.0, 60.0])
 def test_past_motion_reaches_back_the_same_time_at_any_frame_rate(rate_hz):
     past = PastMotion.nothing(3, span_s=0.67)

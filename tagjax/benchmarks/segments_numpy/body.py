@@ -36,7 +36,8 @@ class Rigid:
         v = self.value
         own = weight[:, None] * known[None]
         total = own.sum(axis=-1, keepdims=True)
-        own /= np.where(total > 0, total, 1)
+        enough = total > rigid.LEAST_KNOWN * weight.sum(axis=-1)[:, None, None]
+        own = np.where(enough, own / np.where(enough, total, 1), 0)
         middle_before, middle_after = np.einsum("tla,lad->tld", own, before_m), own @ centre_m
         from_m, to_m = before_m[None] - middle_before[:, :, None], centre_m - middle_after[:, :, None]
         covariance = np.swapaxes(from_m, -1, -2) @ (to_m * own[..., None])

@@ -20,6 +20,9 @@ from jaxtyping import Array, Bool, Float
 from ...core.constrained import Positive
 from ...core.numerics import safe_divide, safe_norm
 
+LEAST_KNOWN = 1e-3
+"""A lag at which less of the body's weight was there says nothing about the body's motion: it counts as none."""
+
 _SQUARINGS = 7
 """The quaternion is found by the power 2^7 of N: eigenvalues whose ratio is 0.95 are separated by a factor of 700."""
 
@@ -83,6 +86,7 @@ class RigidMotion(eqx.Module):
 
         def of_lag(before: Float[Array, "segment 3"], there: Bool[Array, " segment"]) -> Float[Array, " segment"]:
             own = jnp.where(there, weight, 0.0)
+            own = jnp.where(jnp.sum(own) > LEAST_KNOWN * jnp.sum(weight), own, 0.0)
             rotation, shift_m = rigid_fit(own, before, centre_m, self.shrink_m2.value)
             # Points last: XLA sums over a last axis of three several times as slowly on a CPU.
             residual_m2 = jnp.sum(jnp.square(centre_m.T - rotation @ before.T - shift_m[:, None]), axis=0)
