@@ -25,6 +25,7 @@ from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.tracing.clips import ClipSettings
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_sources import FlowDataSettings
+from tagjax.training.hindsight import HindsightSettings
 from tagjax.training.logging import LoggerSettings
 from tagjax.training.loop import LoopSettings
 from tagjax.training.objective import ObjectiveSettings
@@ -174,7 +175,8 @@ def _composed(command: str, *overrides: str) -> Any:
     ("command", "overrides", "path", "schema", "changes"),
     [
         ("train", [], "data", DataSettings, {}),
-        ("train", [], "objective", ObjectiveSettings, {}),
+        ("train", ["experiment=clips"], "objective", ObjectiveSettings, {}),
+        ("train", [], "hindsight", HindsightSettings, {}),
         ("train", [], "scores", ScoreSettings, {}),
         ("train", [], "loop", LoopSettings, {}),
         ("train", [], "logger", LoggerSettings, {}),

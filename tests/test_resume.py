@@ -36,7 +36,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> str:
 def _train(recording: str, run: Path, *more: str) -> list[str]:
     return [
         *(sys.executable, "-m", "experiments.train"),
-        f"data.recordings=[{recording}]",
+        *("experiment=clips", f"data.recordings=[{recording}]"),
         *("data.clips.stride=4", "data.clips.length=8", "data.clips.estimator=literal"),
         # The smallest to compile that learns.
         *("tracer=tagattention_literal", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),

@@ -110,7 +110,8 @@ def _states(storage: Path) -> list[tuple[int, str]]:
 def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) -> None:
     storage = tmp_path / "optuna.db"
     command = [
-        *(sys.executable, "-m", "experiments.train", "-m", "hparams_search=optuna", "logger=disabled"),
+        *(sys.executable, "-m", "experiments.train", "-m", "experiment=clips", "hparams_search=optuna_clips"),
+        "logger=disabled",
         *(f"data.recordings=[{recordings[0]}]", f"data.validation=[{recordings[1]}]", "tracer=tagattention_literal"),
         *("data.clips.stride=4", "data.clips.length=8", "tracer.cell=4", "tracer.softness=1.0", "~baselines"),
         *("loop.num_steps=1", "loop.checkpoint_every=1", "loop.validate_every=1", "loop.progress=false"),

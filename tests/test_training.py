@@ -442,7 +442,9 @@ def _count(folder: Path, num_steps: int, bad: AbstractSet[int] = frozenset(), **
         step = int(state.step) + 1
         return _Counted(state.step + 1), {"loss": float(step), "skipped": float(step in bad)}
 
-    settings = {"checkpoint_every": 100, "validate_every": 100, "progress": False} | more.pop("settings", {})
+    settings = {"batch_size": 1, "checkpoint_every": 100, "validate_every": 100, "progress": False} | more.pop(
+        "settings", {}
+    )
     with Checkpoints(folder / "checkpoints") as checkpoints:
         trained = train(
             _Counted(jnp.zeros((), jnp.int32)),
@@ -487,7 +489,9 @@ def test_a_run_that_diverges_stops_and_names_the_last_good_checkpoint(tmp_path: 
                 state,
                 synthetic.ClipCycle([synthetic.recording(40)]),
                 update=update,
-                settings=LoopSettings(20, checkpoint_every=2, validate_every=20, stop_after_skipped=3, progress=False),
+                settings=LoopSettings(
+                    20, 1, checkpoint_every=2, validate_every=20, stop_after_skipped=3, progress=False
+                ),
                 logger=Logger(tmp_path, LoggerSettings(mode="disabled")),
                 checkpoints=checkpoints,
             )

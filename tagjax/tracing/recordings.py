@@ -108,11 +108,11 @@ def trace_recording(
                 f"smooth: {type(tracer).__name__} has no backward pass; expected TagAttention. Set scores.smooth=false."
             )
         messages = _backward_pass(tracer, recording, load, epcs, settings, (first, last))
-    for number, outputs in _run(_step, tracer, recording, load, epcs, settings, (first, last), messages):
+    for number, outputs in run_tracer(_step, tracer, recording, load, epcs, settings, (first, last), messages):
         yield number, jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(epcs)], *outputs)
 
 
-def _run(
+def run_tracer(
     step: Callable[..., tuple[Any, Any]],
     tracer: AbstractTracer,
     recording: Recording,
@@ -122,7 +122,11 @@ def _run(
     frames: tuple[int, int],
     messages: Callable[[int], list[Any]] | None = None,
 ) -> Iterator[tuple[int, list[Any]]]:
-    """Every frame's number, and the output of `step` for each group of tags (NumPy leaves)."""
+    """Every frame's number, and the output of `step` for each group of tags (NumPy leaves).
+
+    `step(tracer, camera, state, frame)` returns the next state and the output; the first state is `tracer.init`.
+    `messages` gives those of the backward pass by frame, for each group.
+    """
     first, last = frames
     size = min(settings.tags_at_once, len(epcs))
     groups = range(0, len(epcs), size)
@@ -176,7 +180,7 @@ def _backward_pass(
     count, (first, last) = recording.num_frames, frames
     rows: np.ndarray | None = None
     tree: Any = None
-    for number, outputs in _run(
+    for number, outputs in run_tracer(
         _step_back, tracer, time_reversed(recording), load, epcs, settings, (count - last, count - first)
     ):
         leaves, tree = jax.tree.flatten(outputs)

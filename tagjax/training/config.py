@@ -6,7 +6,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from ..core.settings import ConfigError
 from ..metrics.recordings import ScoreSettings
+from .hindsight import HindsightSettings
 from .joint import JointSettings
 from .logging import LoggerSettings
 from .loop import LoopSettings
@@ -29,8 +31,26 @@ class TrainConfig:
     retune: bool = False  # a resumed run may have another clip_norm and other numbers of its optimiser
     joint: JointSettings | None = None  # None: the flow is `data.clips.flow`, computed once
     data: DataSettings = dataclasses.field(default_factory=DataSettings)
-    objective: ObjectiveSettings = dataclasses.field(default_factory=ObjectiveSettings)
+    hindsight: HindsightSettings | None = (
+        None  # what is learned: one of these two, and hindsight where neither is given
+    )
+    objective: ObjectiveSettings | None = None
     loop: LoopSettings = dataclasses.field(default_factory=LoopSettings)
     logger: LoggerSettings = dataclasses.field(default_factory=LoggerSettings)
     distributed: DistributedSettings = dataclasses.field(default_factory=DistributedSettings)
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
+
+    def __post_init__(self) -> None:
+        if self.hindsight is not None and self.objective is not None:
+            raise ConfigError(
+                "found both hindsight and objective; expected one: objective=hindsight or, say, coherent."
+            )
+        if self.joint is not None and isinstance(self.learned, HindsightSettings):
+            raise ConfigError(
+                "joint is on, and learning from hindsight does not reach the flow; expected experiment=clips with it."
+            )
+
+    @property
+    def learned(self) -> HindsightSettings | ObjectiveSettings:
+        """What is learned."""
+        return self.hindsight or self.objective or HindsightSettings()

@@ -28,11 +28,14 @@ def _global_mesh() -> Mesh:
     return Mesh(np.asarray(jax.devices()), (AXIS,))
 
 
-def check_batch(batch_size: int) -> None:
-    """Raises `ValueError` unless every device of every process gets the same number of samples."""
+def check_batch(batch_size: int | None) -> int:
+    """The number of samples. Raises `ValueError` unless every device of every process gets the same number of them."""
     count = jax.device_count()
+    if batch_size is None:
+        raise ValueError("loop.batch_size is null; expected the number of samples in a step.")
     if batch_size % count:
         raise ValueError(f"loop.batch_size is {batch_size}; on {count} devices it must be a multiple of {count}.")
+    return batch_size
 
 
 def shard(batch: T) -> T:

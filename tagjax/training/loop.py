@@ -35,10 +35,10 @@ class DataIterator(Protocol):
 class LoopSettings:
     """The number of steps, and how often logs, checkpoints and validation are written."""
 
-    num_steps: int = 14
-    batch_size: int = 1  # samples whose gradients are averaged in a step, over all devices and processes
-    checkpoint_every: int = 7
-    validate_every: int = 7
+    num_steps: int = 8
+    batch_size: int | None = None  # samples whose gradients are averaged in a step, over all devices and processes
+    checkpoint_every: int = 1
+    validate_every: int = 1
     log_every: int = 1
     stop_after_skipped: int = 5  # steps in a row without a finite gradient
     progress: bool = True
@@ -52,8 +52,9 @@ class LoopSettings:
             "log_every",
             "stop_after_skipped",
         ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"loop.{name} is {getattr(self, name)}; expected at least 1.")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"loop.{name} is {value}; expected at least 1.")
 
 
 class DivergedError(RuntimeError):

@@ -29,6 +29,7 @@ OPTIMIZERS = {
         "novograd",
         "radam",
         "rmsprop",
+        "rprop",
         "sgd",
         "yogi",
     )

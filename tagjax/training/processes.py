@@ -89,9 +89,11 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
-def local_batch_size(batch_size: int) -> int:
+def local_batch_size(batch_size: int | None) -> int:
     """The number of a batch's samples for each process. Raises `ValueError` unless the batch divides evenly."""
     count = jax.process_count()
+    if batch_size is None:
+        raise ValueError("loop.batch_size is null; expected the number of samples in a step.")
     if batch_size % count:
         raise ValueError(f"loop.batch_size is {batch_size}; over {count} processes it must be a multiple of {count}.")
     return batch_size // count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,10 @@ from ..recording import Recording
 from ..report.report import score_table
 from ..tagattention.learned import LearnableTracer, save_parameters
 from ..tagattention.tracer_settings import baseline_clips, make_tracer
-from ..tracing.clips import Clip, clip_loader
 from ..tracing.tracer import AbstractTracer
 from .checkpoint import Checkpoints
-from .clip_dataset import clip_dataset
 from .config import TrainConfig
+from .data import TrainingData, training_data
 from .evaluate import evaluate_tracers, parameters, smoothing_tracers
 from .flow_run import initial_network
 from .joint import JointModel, save_network
@@ -34,9 +33,7 @@ from .optimizers import build_optimizer
 from .processes import distributed_runtime, is_first, local_batch_size
 from .sources import training_recordings
 from .state import TrainState
-from .step import clip_loss, make_joint_optimizer, make_optimizer, train_step
-
-VALIDATION_CLIPS = 2
+from .step import ClipLike, clip_loss, make_joint_optimizer, make_optimizer, train_step
 
 
 def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
@@ -76,8 +73,8 @@ def run_training(
 ) -> float:
     """Train as configured, evaluate on the validation recordings, and return the objective of a sweep, to be maximised.
 
-    The objective is the mean box IoU on the validation recordings if they are labelled, else the coherence of their reads
-    with the masks' motion; NaN without validation recordings. `folder` then holds checkpoints, metrics.jsonl, the learned
+    The objective is the mean box IoU on the validation recordings if they are labelled, else the masks' overlap with the
+    smoother's, or, without hindsight, the coherence of the reads with the masks' motion; NaN without validation recordings. `folder` then holds checkpoints, metrics.jsonl, the learned
     parameters (weights.json, parameters.json, flow.safetensors), and with validation recordings metrics.json and report/.
     Ctrl-C and SIGTERM make it write a checkpoint and raise `KeyboardInterrupt` or `Terminated`; the run resumes when it is
     started again in the same folder. With several processes (`config.distributed`) process 0 writes and evaluates; the
@@ -105,7 +102,7 @@ def _run(
                 on_start()
         training, validation = training_recordings(config.data)
         _describe(console, training, validation)
-        trained, logger = _train(config, folder, training, validation, console)
+        trained, data, logger = _train(config, folder, training, validation, console)
     try:
         if trained.stopped_by:
             console.print(
@@ -117,6 +114,7 @@ def _run(
         tracers, flows = _save_learned(config, folder, trained.state)
         if not validation:
             console.print("No validation recordings (data.validation is empty): no evaluation.")
+            data.remove()
             return float("nan")
         summary = _report(config, folder, tracers, flows, validation)
         name, learned = next(iter(summary.items()))  # the learned tracer comes first
@@ -125,11 +123,10 @@ def _run(
         logger.close()
     console.print(score_table(summary, title="validation recordings"))
     iou = learned["all"].get("iou")
-    if iou is not None:
-        return float(iou)
-    return validation_metrics(trained.state, validation_clips(config, validation), config).get(
-        "own_coherence", float("nan")
-    )
+    if iou is None:
+        iou = validation_metrics(trained.state, data.held_out, config).get(data.score, float("nan"))
+    data.remove()
+    return float(iou)
 
 
 def _train(
@@ -138,59 +135,45 @@ def _train(
     training: Sequence[Recording],
     validation: Sequence[Recording],
     console: Console,
-) -> tuple[TrainingResult[TrainState], Logger]:
-    """The trained state, and the logger, which stays open for the report."""
-    clips, batch_size = config.data.clips, config.loop.batch_size
+) -> tuple[TrainingResult[TrainState], TrainingData, Logger]:
+    """The trained state, its data, and the logger, which stays open for the report."""
     state, optimizer = initial_state(config)
-    source = iter(
-        clip_dataset(
-            training,
-            clip_length=clips.length,
-            seed=config.seed,
-            epcs=clips.epcs,
-            min_motion=clips.min_motion,
-            max_tags=clips.max_tags,
-            workers=clips.workers,
-            shard=(jax.process_index(), jax.process_count()),
-            colour=config.joint is not None,
-            **clips.arguments(),
-        )
-    )
-    idle = jax.local_device_count() - local_batch_size(batch_size)
+    data = training_data(config, folder, training, validation, console)
+    loop = dataclasses.replace(config.loop, batch_size=data.batch_size)
+    source = iter(data.samples)
+    idle = jax.local_device_count() - local_batch_size(data.batch_size)
     if idle > 0:
-        console.print(f"loop.batch_size={batch_size} leaves {idle} of {jax.local_device_count()} devices idle.")
-    # Every process evaluates all of them, so that none waits for another.
-    clips_held_out = validation_clips(config, validation)
+        console.print(f"loop.batch_size={data.batch_size} leaves {idle} of {jax.local_device_count()} devices idle.")
     with Checkpoints(folder / "checkpoints") as checkpoints:
         state = resume_state(state, source, checkpoints, allowed=config.resume)
         if int(state.step):
             console.print(f"Resumed at step {int(state.step)} of {config.loop.num_steps}.")
         logger = Logger(folder, config.logger, config=dataclasses.asdict(config), resume_step=int(state.step))
 
-        def update(state: TrainState, clips: Sequence[Clip]) -> tuple[TrainState, dict[str, float]]:
-            state, numbers = train_step(state, clips, optimizer, config.objective)
+        def update(state: TrainState, clips: Sequence[ClipLike]) -> tuple[TrainState, dict[str, float]]:
+            state, numbers = train_step(state, clips, optimizer, config.learned)
             values = {f"parameter/{name}": value for name, value in parameters(state.tracer).items()}
             return state, numbers | values
 
         def validate(state: TrainState) -> dict[str, float]:
-            return validation_metrics(state, clips_held_out, config)
+            return validation_metrics(state, data.held_out, config)
 
         try:
             trained = train(
                 state,
                 source,
                 update=update,
-                settings=config.loop,
+                settings=loop,
                 logger=logger,
                 checkpoints=checkpoints,
-                validate=validate if clips_held_out else None,
+                validate=validate if data.held_out else None,
             )
         except BaseException:
             logger.close()
             raise
         finally:
             source.close()
-    return trained, logger
+    return trained, data, logger
 
 
 def _save_learned(
@@ -239,23 +222,11 @@ def _report(
     return summary
 
 
-def validation_metrics(state: TrainState, clips: Sequence[Clip], config: TrainConfig) -> dict[str, float]:
-    """Mean of every term and diagnostic over validation clips, always with the same random shifts."""
+def validation_metrics(state: TrainState, held_out: Iterable[ClipLike], config: TrainConfig) -> dict[str, float]:
+    """Mean of every term and diagnostic over the held-out samples, always with the same random numbers."""
     key = jax.random.PRNGKey(config.seed)
-    values = [clip_loss(state.model, clip.camera, clip.frames, key, config.objective) for clip in clips]
-    return {name: float(np.mean([float(clip[name]) for clip in values])) for name in values[0]}
-
-
-def validation_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list[Clip]:
-    """`VALIDATION_CLIPS` evenly spaced clips of each recording, of the training clips' length (or shorter, if the recording is)."""
-    settings = config.data.clips
-    load = clip_loader(settings, colour=config.joint is not None)
-    clips = []
-    for recording in recordings:
-        length = min(settings.length, recording.num_frames)
-        starts = np.linspace(0, recording.num_frames - length, VALIDATION_CLIPS).astype(int)
-        clips += [load(recording, int(start), int(start) + length) for start in sorted(set(starts.tolist()))]
-    return clips
+    values = [clip_loss(state.model, sample.camera, sample.frames, key, config.learned) for sample in held_out]
+    return {name: float(np.mean([float(sample[name]) for sample in values])) for name in values[0]}
 
 
 def _describe(console: Console, training: Sequence[Recording], validation: Sequence[Recording]) -> None:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, PyTree, UInt32
 from ..core.compilation import large_program
 from ..tracing.tracer import AbstractTracer, Camera, Frame
 from .devices import AXIS, local_mesh, replicate_locally, shard_locally
+from .hindsight import HindsightSettings, PieceFrames
 from .joint import Flow, JointModel, network_flow
 from .objective import ObjectiveSettings, objective
 from .processes import mean_over_processes
@@ -36,7 +37,22 @@ class ClipLike(Protocol):
     def camera(self) -> Camera: ...
 
     @property
-    def frames(self) -> Frame: ...
+    def frames(self) -> Frame | PieceFrames: ...
+
+
+Objective = ObjectiveSettings | HindsightSettings
+"""What is learned: from clips, or from hindsight (pieces of recordings)."""
+
+
+def objective_terms(
+    tracer: AbstractTracer, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
+) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
+    """Every term that has a weight, unweighted, and diagnostics, of one clip or piece."""
+    if isinstance(settings, HindsightSettings):
+        assert isinstance(frames, PieceFrames)
+        return settings.terms(tracer, camera, frames)
+    assert isinstance(frames, Frame)
+    return objective(tracer, camera, frames, key, settings)
 
 
 def make_optimizer(inner: optax.GradientTransformation, clip_norm: float) -> optax.GradientTransformation:
@@ -65,7 +81,7 @@ def make_joint_optimizer(
 
 @large_program()
 def clip_gradient(
-    model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
     """Gradient of the weighted objective of one clip, each term's value, and with `term_norms` its gradient's norm.
 
@@ -75,11 +91,14 @@ def clip_gradient(
 
 
 def _clip_gradient(
-    model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
     if not isinstance(model, JointModel):
         (gradient, _), logged = _term_gradients(model, None, camera, frames, key, settings)
+        if isinstance(settings, HindsightSettings):
+            gradient = settings.bounded(gradient)
         return gradient, logged
+    assert isinstance(frames, Frame)
     learnable, static = eqx.partition(model.network, eqx.is_inexact_array)
 
     def compute_flow(learnable: PyTree) -> tuple[tuple[Flow, Array], dict[str, Array]]:
@@ -99,9 +118,9 @@ def _term_gradients(
     tracer: AbstractTracer,
     flow: Flow | None,
     camera: Camera,
-    frames: Frame,
+    frames: Frame | PieceFrames,
     key: Array,
-    settings: ObjectiveSettings,
+    settings: Objective,
 ) -> tuple[tuple[PyTree, Flow | None], dict[str, Float[Array, ""]]]:
     """Gradient of the weighted terms by the tracer and, where it is given, by the flow; and the values to log.
 
@@ -112,8 +131,8 @@ def _term_gradients(
 
     def terms(inputs: tuple[PyTree, Flow | None]) -> tuple[dict[str, Array], dict[str, Array]]:
         learnable, flow = inputs
-        given = frames if flow is None else flow.replace_in(frames)
-        return objective(eqx.combine(learnable, static), camera, given, key, settings)
+        given = flow.replace_in(frames) if flow is not None and isinstance(frames, Frame) else frames
+        return objective_terms(eqx.combine(learnable, static), camera, given, key, settings)
 
     values, pull, diagnostics = jax.vjp(terms, (learnable, flow), has_aux=True)
     logged = {**diagnostics, **values}
@@ -140,12 +159,12 @@ def _term_gradients(
 
 @large_program()
 def _gradients_side_by_side(
-    model: Model, camera: Camera, frames: Frame, keys: UInt32[Array, "clip 2"], settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame | PieceFrames, keys: UInt32[Array, "clip 2"], settings: Objective
 ) -> tuple[PyTree, dict[str, Float[Array, " clip"]]]:
     """`clip_gradient` of stacked clips, one on each device of this process."""
     arrays, static = eqx.partition(model, eqx.is_array)
 
-    def on_one(arrays: PyTree, camera: Camera, frames: Frame, key: Array) -> Any:
+    def on_one(arrays: PyTree, camera: Camera, frames: Frame | PieceFrames, key: Array) -> Any:
         # Each device holds one clip: mapped, not vectorised, so that it runs the program of a single clip.
         camera, frames, key = jax.tree.map(lambda leaf: leaf[0], (camera, frames, key))
         result = _clip_gradient(eqx.combine(arrays, static), camera, frames, key, settings)
@@ -164,7 +183,7 @@ def _shapes(clip: ClipLike) -> Any:
 
 
 def _gradients(
-    model: Model, clips: Sequence[ClipLike], keys: Sequence[Array], settings: ObjectiveSettings
+    model: Model, clips: Sequence[ClipLike], keys: Sequence[Array], settings: Objective
 ) -> Iterator[tuple[PyTree, dict[str, Array]]]:
     """Gradient and logged values of each clip, in no particular order."""
     count = jax.local_device_count()
@@ -194,18 +213,19 @@ def _gradients(
 
 @large_program()
 def clip_loss(
-    model: Model, camera: Camera, frames: Frame, key: Array, settings: ObjectiveSettings
+    model: Model, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
 ) -> dict[str, Float[Array, ""]]:
     """Terms, diagnostics and the weighted sum of one clip, without gradients."""
     terms: dict[str, Array] = {"loss": jnp.zeros(())}
     if isinstance(model, JointModel):
+        assert isinstance(frames, Frame)
         flow, own_loss, flow_terms = network_flow(model.network, frames, model.loss)
         model, frames, terms = (
             model.tracer,
             flow.replace_in(frames),
             {**flow_terms, "flow": own_loss, "loss": model.weight * own_loss},
         )
-    values, diagnostics = objective(model, camera, frames, key, settings)
+    values, diagnostics = objective_terms(model, camera, frames, key, settings)
     loss = sum((weight * values[name] for name, weight in settings.weights().items()), start=terms["loss"])
     return {**terms, **diagnostics, **values, "loss": loss}
 
@@ -231,7 +251,7 @@ def train_step(
     state: TrainState,
     clips: Sequence[ClipLike],
     optimizer: optax.GradientTransformation,
-    settings: ObjectiveSettings,
+    settings: Objective,
 ) -> tuple[TrainState, dict[str, float]]:
     """One update from the mean gradient over some clips, which may differ in shape.
 

@@ -16,23 +16,26 @@ from .labels import Labelling, Segmenter, SegmentState
 
 
 class SegmentFrame(eqx.Module):
-    """The segments of a frame, shared by all tags. Slot 0 is the static background; unused slots have area 0."""
+    """The segments of a frame, shared by all tags. Slot 0 is the static background; unused slots have area 0.
 
-    labels: Int[Array, "height width"]  # slot of each pixel, -1 = none
-    increment_m: Float[Array, "antenna segment"]  # change of the range since the last frame, 0 where not known
-    motion_m: Float[Array, "segment 3"]  # camera frame, 0 where not known
-    known: Bool[Array, " segment"]
-    centre_m: Float[Array, "segment 3"]  # camera frame
-    area: Float[Array, " segment"]  # pixels
-    size_m: Float[Array, " segment"]  # side of a square of this area at its depth
-    life_s: Float[Array, " segment"]  # since birth
-    displacement_m: Float[Array, "segment 3"]  # since birth
-    moved: Bool[Array, " segment"]  # was ever displaced by `labels.moved_m`
-    front: Float[Array, " segment"]  # fraction of its pixels in front of all that has been seen at rest there
-    source: Int[Array, " segment"]  # slot of the last frame that a new segment comes from, -1 = none; -2 = not new
-    num_unplaced: Int[Array, ""]  # new segments that found no free slot
+    Several frames have a leading axis of time.
+    """
+
+    labels: Int[Array, "*time height width"]  # slot of each pixel, -1 = none
+    increment_m: Float[Array, "*time antenna segment"]  # change of the range since the last frame, 0 where not known
+    motion_m: Float[Array, "*time segment 3"]  # camera frame, 0 where not known
+    known: Bool[Array, "*time segment"]
+    centre_m: Float[Array, "*time segment 3"]  # camera frame
+    area: Float[Array, "*time segment"]  # pixels
+    size_m: Float[Array, "*time segment"]  # side of a square of this area at its depth
+    life_s: Float[Array, "*time segment"]  # since birth
+    displacement_m: Float[Array, "*time segment 3"]  # since birth
+    moved: Bool[Array, "*time segment"]  # was ever displaced by `labels.moved_m`
+    front: Float[Array, "*time segment"]  # fraction of its pixels in front of all that has been seen at rest there
+    source: Int[Array, "*time segment"]  # slot of the last frame that a new segment comes from, -1 = none; -2 = not new
+    num_unplaced: Int[Array, "*time"]  # new segments that found no free slot
     background_lost: Float[
-        Array, ""
+        Array, "*time"
     ]  # fraction of the confirmed background that shows another depth: near 1, the camera moved
 
 

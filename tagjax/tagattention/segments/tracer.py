@@ -110,12 +110,13 @@ class TagAttention(AbstractSmoother):
         num_tags, num_window = frame.present.shape[-1], frame.radio.relative_m.shape[-1]
         return TagAttentionState(
             segments=self.segments.init(camera),
-            tags=self._no_reads(num_tags, camera.antennas_m.shape[0], num_window, frame.time_s),
+            tags=self.no_reads(num_tags, camera.antennas_m.shape[0], num_window, frame.time_s),
             background_lost=jnp.zeros(()),
             camera_moved=jnp.zeros((), bool),
         )
 
-    def _no_reads(self, num_tags: int, num_antennas: int, num_window: int, time_s: Float[Array, ""]) -> TagState:
+    def no_reads(self, num_tags: int, num_antennas: int, num_window: int, time_s: Float[Array, ""]) -> TagState:
+        """The state of the tags before the first frame: what `associate` begins with."""
         num_segments = self.segments.segmenter.num_segments
         dwell = attention = None
         if self.dwell is not None:
@@ -330,7 +331,7 @@ class TagAttention(AbstractSmoother):
     def with_tags(self, camera: Camera, state: TagAttentionState, source: Int[Array, " tag"]) -> TagAttentionState:
         """The state for other tags: `source` is each one's place among the present ones, -1 for a new tag."""
         num_window = 1 if state.tags.attention is None else state.tags.attention.num_window
-        fresh = self._no_reads(source.shape[0], camera.antennas_m.shape[0], num_window, state.tags.time_s)
+        fresh = self.no_reads(source.shape[0], camera.antennas_m.shape[0], num_window, state.tags.time_s)
 
         def moved(new: Array, old: Array) -> Array:
             known = (source >= 0).reshape(-1, *[1] * (new.ndim - 1))

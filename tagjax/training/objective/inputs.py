@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Int
 
 from ...radio.reads import PhaseReads
 from ...tracing.tracer import STORED, AbstractTracer, Camera, Frame, Trace, trace
+from ..fading import faded
 
 TERM_NAMES = ("contrast", "coverage", "area", "compactness", "steadiness", "calibration")
 """Names of the objective's terms; the settings hold a weight of each name."""
@@ -75,8 +76,7 @@ class ObjectiveInputs(eqx.Module):
 class _FadingTracer(AbstractTracer):
     """A tracer with another backward pass: steps are recomputed rather than stored, and gradients fade into the past.
 
-    A recurrent tracer multiplies gradients from frame to frame; without fading, those of the first frames dominate all
-    others. Values of the forward pass are unchanged.
+    Values of the forward pass are unchanged.
     """
 
     tracer: AbstractTracer
@@ -87,21 +87,13 @@ class _FadingTracer(AbstractTracer):
         return self.tracer.init(camera, frame)
 
     def step(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Trace]:
-        state = jax.tree.map(self._fade, state)
+        state = faded(state, self.memory)
         if not self.rematerialise:
             return self.tracer.step(camera, state, frame)
         policy = jax.checkpoint_policies.save_only_these_names(STORED)
         # In a scan nothing can be merged across the forward and the backward pass.
         again = eqx.filter_checkpoint(lambda t, c, s, f: t.step(c, s, f), prevent_cse=False, policy=policy)
         return again(self.tracer, camera, state, frame)
-
-    def _fade(self, leaf: Array) -> Array:
-        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
-            return leaf
-        # At the ends of the range a product would be 0 times infinity: states hold times that are minus infinity.
-        if self.memory in (0.0, 1.0):
-            return leaf if self.memory else jax.lax.stop_gradient(leaf)
-        return self.memory * leaf + jax.lax.stop_gradient((1.0 - self.memory) * leaf)
 
     def finish(self, state: Any) -> Any:
         return self.tracer.finish(state)

@@ -1,0 +1,125 @@
+"""What a training run draws its samples from, and what it is validated on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import grain
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from ..core.errors import RecordingError
+from ..core.settings import ConfigError
+from ..core.stream import Stream
+from ..recording import Recording
+from ..tagattention.segments import TagAttention
+from ..tagattention.tracer_settings import make_tracer
+from ..tracing.clips import clip_loader
+from .clip_dataset import clip_dataset
+from .config import TrainConfig
+from .hindsight import HindsightSettings, PieceFiles
+from .step import ClipLike
+
+VALIDATION_CLIPS = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingData:
+    """Samples for training, without end, and samples of the validation recordings."""
+
+    samples: Stream
+    batch_size: int  # samples in a step
+    held_out: Sequence[ClipLike] | PieceFiles
+    score: str  # the diagnostic of `held_out` that says how good unlabelled results are
+    remove: Callable[[], None] = lambda: None  # deletes what is of no use after the run
+
+
+def training_data(
+    config: TrainConfig, folder: Path, training: Sequence[Recording], validation: Sequence[Recording], console: Console
+) -> TrainingData:
+    """The samples of a run in `folder`, for what it learns."""
+    if isinstance(config.learned, HindsightSettings):
+        return _pieces(config, config.learned, folder, training, validation, console)
+    clips = config.data.clips
+    samples = clip_dataset(
+        training,
+        clip_length=clips.length,
+        seed=config.seed,
+        epcs=clips.epcs,
+        min_motion=clips.min_motion,
+        max_tags=clips.max_tags,
+        workers=clips.workers,
+        shard=(jax.process_index(), jax.process_count()),
+        colour=config.joint is not None,
+        **clips.arguments(),
+    )
+    # Every process has all validation clips, so that none waits for another.
+    return TrainingData(samples, config.loop.batch_size or 1, _validation_clips(config, validation), "own_coherence")
+
+
+def _validation_clips(config: TrainConfig, recordings: Sequence[Recording]) -> list[ClipLike]:
+    """`VALIDATION_CLIPS` evenly spaced clips of each recording, of the training clips' length (or shorter, if the recording is)."""
+    settings = config.data.clips
+    load = clip_loader(settings, colour=config.joint is not None)
+    clips: list[Any] = []
+    for recording in recordings:
+        length = min(settings.length, recording.num_frames)
+        starts = np.linspace(0, recording.num_frames - length, VALIDATION_CLIPS).astype(int)
+        clips += [load(recording, int(start), int(start) + length) for start in sorted(set(starts.tolist()))]
+    return clips
+
+
+def _pieces(
+    config: TrainConfig,
+    settings: HindsightSettings,
+    folder: Path,
+    training: Sequence[Recording],
+    validation: Sequence[Recording],
+    console: Console,
+) -> TrainingData:
+    """The pieces of all recordings, written to `folder`/pieces where they are not there yet."""
+    tracer = make_tracer(config.tracer, config.weights)
+    if not isinstance(tracer, TagAttention):
+        raise ConfigError(
+            f"hindsight: {type(tracer).__name__} has no smoother to learn from; expected tracer=tagattention, or "
+            "objective=coherent."
+        )
+    if jax.process_count() > 1:
+        raise ConfigError(
+            f"hindsight: found {jax.process_count()} processes; expected one, with any number of devices. For several, "
+            "objective=coherent."
+        )
+    columns = (
+        TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    found = {}
+    with Progress(*columns, console=console, disable=not config.loop.progress) as progress:
+        for kind, recordings in (("training", training), ("validation", validation)):
+            task = progress.add_task(f"smoothed {kind} recordings", total=len(recordings))
+            found[kind] = PieceFiles(folder / "pieces" / kind).made(
+                recordings,
+                tracer,
+                clip_loader(config.data.clips),
+                epcs=config.data.clips.epcs,
+                num_frames=settings.piece_frames,
+                on_progress=lambda done, task=task: progress.update(task, completed=done),
+            )
+    files, sure = found["training"], found["training"].num_sure(settings)
+    if not sure:
+        raise RecordingError(
+            f"hindsight: the smoother is sure (confidence above {settings.sure}) of no tag in any of {len(training)} "
+            "recordings, so there is nothing to learn. Give recordings in which tags move and are read."
+        )
+    console.print(f"The smoother is sure of a tag in {sure} tag-frames of {len(files)} pieces.")
+    batch_size = config.loop.batch_size or len(files)
+    dataset = grain.MapDataset.source(files)
+    if batch_size < len(files):
+        dataset = dataset.shuffle(seed=config.seed)
+    samples = Stream(dataset.repeat())
+    return TrainingData(samples, batch_size, found["validation"], "overlap", PieceFiles(folder / "pieces").remove)

@@ -1,0 +1,229 @@
+"""Learning from hindsight: pieces hold what the tracer sees, and the loss is that of the smoother's masks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_segment_tracer import EPCS, scene
+
+from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.recording import Recording, RecordingError, TagReads
+from tagjax.recording.store import save_recording
+from tagjax.tagattention.segments import Segmenter, SegmentTracker, TagAttention
+from tagjax.tracing.clips import ClipSettings, clip_loader
+from tagjax.tracing.recordings import TraceSettings, trace_recording
+from tagjax.training.config import TrainConfig
+from tagjax.training.fading import faded
+from tagjax.training.hindsight import HindsightSettings, Piece, PieceFiles, segment_pieces
+from tagjax.training.hindsight.objective import hindsight_sums
+from tagjax.training.hindsight.pieces import frame_of
+from tagjax.training.run import run_training
+from tagjax.training.step import clip_gradient
+
+SETTINGS = HindsightSettings()
+LOAD = clip_loader(ClipSettings(stride=1, flow="zero"))
+TRACER = TagAttention(segments=SegmentTracker(segmenter=Segmenter(num_segments=256)))
+KEY = jax.random.PRNGKey(0)
+
+
+@pytest.fixture(scope="module")
+def piece() -> Piece:
+    (one,) = segment_pieces(scene(70), TRACER, LOAD, epcs=list(EPCS))
+    return one
+
+
+@eqx.filter_jit
+def _associated(tracer: TagAttention, piece_frames: Any, camera: Any) -> tuple[Any, Any]:
+    def step(state: Any, frame: Any) -> tuple[Any, Any]:
+        state, out = tracer.associate(camera, state, frame.found, frame_of(frame, camera.antennas_m.shape[0]))
+        return state, (out.membership, out.confidence)
+
+    num_tags, window = piece_frames.present.shape[1], piece_frames.radio.relative_m.shape[-1]
+    state = tracer.no_reads(num_tags, camera.antennas_m.shape[0], window, piece_frames.time_s[0])
+    return jax.lax.scan(step, state, piece_frames)[1]
+
+
+def test_a_piece_holds_all_that_tracing_sees(piece: Piece) -> None:
+    _, confidence = _associated(TRACER, piece.frames, piece.camera)
+    traced = [out.confidence for _, out in trace_recording(TRACER, scene(70), LOAD, epcs=list(EPCS))]
+    np.testing.assert_allclose(confidence[: piece.num_frames], np.stack(traced), atol=1e-6)
+
+
+def test_targets_are_the_smoothers_masks(piece: Piece) -> None:
+    settings = TraceSettings(smooth=True)
+    last = [out for _, out in trace_recording(TRACER, scene(70), LOAD, epcs=list(EPCS), settings=settings)][50]
+    np.testing.assert_allclose(piece.frames.confidence[50], last.confidence, atol=1e-6)
+    frames = piece.frames
+    inside = np.asarray(frames.target[50]) @ np.asarray(frames.found.area[50])
+    np.testing.assert_allclose(inside, np.sum(np.asarray(last.mask) > 0.5, axis=(1, 2)), rtol=0.05)
+    assert frames.target.shape == (96, 2, 256)
+    assert not np.any(frames.present[70:])
+    assert np.all(np.diff(frames.time_s) > 0)
+
+
+def test_the_loss_is_that_of_the_masks(piece: Piece) -> None:
+    frames, area = piece.frames, np.asarray(piece.frames.found.area)
+    membership, confidence = (np.asarray(each) for each in _associated(TRACER, frames, piece.camera))
+    target, sure = np.asarray(frames.target), np.asarray(frames.confidence)
+    missed, claimed, num_there, num_away = [], [], 0, 0
+    for time in range(piece.num_frames):
+        for tag in range(2):
+            mask = membership[time, tag] * confidence[time, tag]
+            both = np.sum(mask * target[time, tag] * area[time])
+            either = np.sum((mask + target[time, tag]) * area[time]) - both
+            if sure[time, tag] > 0.9 and np.sum(target[time, tag] * area[time]) > 0:
+                missed.append(1 - both / either)
+                num_there += 1
+            elif sure[time, tag] < 0.1:
+                claimed.append(confidence[time, tag])
+                num_away += 1
+    found = eqx.filter_jit(hindsight_sums)(TRACER, piece.camera, frames, SETTINGS)
+    np.testing.assert_allclose(found, [np.sum(missed), np.sum(claimed), num_there, num_away], rtol=1e-4)
+    assert num_there > 60
+
+
+def test_padding_changes_nothing(piece: Piece) -> None:
+    short = jax.tree.map(lambda leaf: leaf[: piece.num_frames], piece.frames)
+    whole, alone = (eqx.filter_jit(hindsight_sums)(TRACER, piece.camera, f, SETTINGS) for f in (piece.frames, short))
+    np.testing.assert_allclose(whole, alone, rtol=1e-5)
+
+
+def test_a_step_against_the_gradient_lowers_the_loss(piece: Piece) -> None:
+    gradient, logged = clip_gradient(TRACER, piece.camera, piece.frames, KEY, SETTINGS)
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(gradient)]
+    assert all(np.isfinite(leaf).all() for leaf in leaves)
+    assert np.sqrt(sum(np.sum(leaf**2) for leaf in leaves)) <= SETTINGS.clip_norm * (1 + 1e-5)
+    learnable, static = eqx.partition(TRACER, eqx.is_inexact_array)
+    moved = eqx.combine(jax.tree.map(lambda p, g: p - 0.02 * jnp.sign(g), learnable, gradient), static)
+    missed, claimed, there, away = eqx.filter_jit(hindsight_sums)(moved, piece.camera, piece.frames, SETTINGS)
+    assert (missed + claimed) / (there + away) < logged["loss"]
+
+
+@pytest.mark.ci
+def test_long_recordings_are_cut_and_tags_padded() -> None:
+    one = scene(70)
+    third = dataclasses.replace(one.reads, epc=np.where(np.arange(one.reads.num_reads) % 9 == 0, "C", one.reads.epc))
+    pieces = list(segment_pieces(dataclasses.replace(one, reads=third), TRACER, LOAD, epcs=[*EPCS, "C"], num_frames=30))
+    assert [(p.start, p.num_frames) for p in pieces] == [(0, 23), (23, 23), (46, 24)]
+    for each in pieces:
+        assert each.frames.present.shape == (32, 4)
+        np.testing.assert_array_equal(each.frames.present[0], [True, True, True, False])
+
+
+def test_files_hold_the_pieces_and_are_made_once(piece: Piece, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = lambda: PieceFiles(tmp_path / "pieces").made([scene(70)], TRACER, LOAD, epcs=None, num_frames=256)  # noqa: E731
+    (back,) = make()
+    assert (back.name, back.start, back.num_frames) == (piece.name, 0, 70)
+    for one, other in zip(jax.tree.leaves(back.frames), jax.tree.leaves(piece.frames), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+    def again(*_: Any, **__: Any) -> None:
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr("tagjax.training.hindsight.files.segment_pieces", again)
+    files = make()
+    assert len(files) == 1
+    assert files.num_sure(SETTINGS) > 60
+    files.remove()
+    assert not (tmp_path / "pieces").exists()
+
+
+def test_gradients_fade_and_values_stay() -> None:
+    state = {"a": jnp.array([1.5, -jnp.inf, jnp.nan, 0.1]), "n": jnp.array([3])}
+    after = faded(state, 0.7)
+    jax.tree.map(np.testing.assert_array_equal, after, state)
+    slope = jax.grad(lambda x: jnp.sum(faded(faded({"x": x}, 0.5), 0.5)["x"] ** 2))(jnp.array([3.0, 0.0]))
+    np.testing.assert_allclose(slope, [1.5, 0.0])
+
+
+LEAST = {
+    "tracer": {"_target_": "tagjax.tagattention.TagAttention", "segments": {"segmenter": {"num_segments": 256}}},
+    "optimizer": {"_target_": "optax.rprop", "learning_rate": 0.02},
+}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"hindsight": {}, "objective": {}}, "found both hindsight and objective; expected one"),
+        ({"hindsight": {"sure": 0.3}}, r"hindsight: sure is 0\.3; expected a confidence from 0\.5 to 1"),
+        ({"hindsight": {"memory": 1.5}}, r"hindsight: memory is 1\.5; expected a fraction"),
+        ({"hindsight": {"clip_norm": 0}}, r"hindsight: clip_norm is 0(\.0)?; expected a positive norm"),
+        ({"hindsight": {"piece_frames": 0}}, "hindsight: piece_frames is 0; expected at least 1"),
+        (
+            {"joint": {"flow": {}, "optimizer": {}}},
+            "learning from hindsight does not reach the flow; expected experiment=clips",
+        ),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        from_mapping(TrainConfig, {**LEAST, **given})
+
+
+def _run(recordings: list[Path], folder: Path, **more: Any) -> float:
+    values = {
+        **LEAST,
+        "data": {
+            "recordings": [str(recordings[0])],
+            "validation": [str(path) for path in recordings[1:]],
+            "clips": {"stride": 1, "flow": "zero"},
+        },
+        "loop": {"num_steps": 3, "progress": False},
+        "logger": {"mode": "disabled"},
+        "scores": {"num_pictures": 1, "from_s": 0.5},
+        **more,
+    }
+    return run_training(from_mapping(TrainConfig, values), folder)
+
+
+def _stored(recording: Recording, path: Path) -> Path:
+    save_recording(recording, path)
+    return path
+
+
+@pytest.mark.ci
+def test_a_run_learns_and_resumes(tmp_path: Path) -> None:
+    paths = [
+        _stored(scene(46), tmp_path / "a.zarr"),
+        _stored(dataclasses.replace(scene(46), name="b"), tmp_path / "b.zarr"),
+    ]
+    score = _run(paths, tmp_path / "whole")
+    assert score > 0.3
+    rows = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
+    losses = [row["loss"] for row in rows if "loss" in row]
+    assert losses[-1] < losses[0]
+    assert "validation/overlap" in rows[-1]
+    assert not (tmp_path / "whole" / "pieces").exists()
+    _run(paths, tmp_path / "parts", loop={"num_steps": 1, "progress": False})
+    assert _run(paths, tmp_path / "parts") == score
+    whole, parts = (json.loads((tmp_path / name / "weights.json").read_text()) for name in ("whole", "parts"))
+    assert whole["parameters"] == parts["parameters"]
+
+
+@pytest.mark.ci
+def test_what_cannot_teach_is_reported_before_the_training(tmp_path: Path) -> None:
+    one = scene(40)
+    silent = dataclasses.replace(one, reads=_few(one.reads))
+    with pytest.raises(RecordingError, match=r"hindsight: the smoother is sure .* of no tag in any of 1 recordings"):
+        _run([_stored(silent, tmp_path / "silent.zarr")], tmp_path / "run")
+    literal = {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "softness": 0.3}
+    with pytest.raises(
+        ConfigError, match="TagAttentionLiteral has no smoother to learn from; expected tracer=tagattention"
+    ):
+        _run([_stored(one, tmp_path / "a.zarr")], tmp_path / "other", tracer=literal)
+
+
+def _few(reads: TagReads) -> TagReads:
+    """One read of each tag."""
+    first = [int(np.flatnonzero(reads.epc == epc)[0]) for epc in EPCS]
+    return reads[np.isin(np.arange(reads.num_reads), first)]
