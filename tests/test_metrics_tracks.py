@@ -105,6 +105,9 @@ def test_curves_are_aligned_to_the_first_motion() -> None:
     alone = motion_curves([{"a": early}])
     assert np.isnan(alone["iou"].low).all()
     assert motion_curves([])["iou"].mean.size == 0
+    # Several recordings of which no frame counts.
+    hidden = frame_scores([0.2, 0.4], visible=[False, False])
+    assert np.isnan(motion_curves([{"a": hidden}, {"a": hidden}])["iou"].mean).all()
 
 
 def test_a_curve_at_one_frame_is_the_bootstrap_of_means() -> None:

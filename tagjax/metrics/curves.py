@@ -54,8 +54,8 @@ def _curve(totals: np.ndarray, counts: np.ndarray) -> Curve:
         resampled = _ratio(drawn @ totals, drawn @ counts)
         some = np.isfinite(resampled).any(axis=0)
         low, high = low.copy(), high.copy()
-        bounds = np.nanquantile(resampled[:, some], [0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], axis=0)
-        low[some], high[some] = bounds
+        if some.any():
+            low[some], high[some] = np.nanquantile(resampled[:, some], [0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], axis=0)
     return Curve(mean, low, high, counts.sum(axis=0).astype(np.int64))
 
 
