@@ -118,7 +118,7 @@ def test_the_traced_box_is_compared_with_that_of_the_carrier(tmp_path: Path) -> 
     assert written == ["0.5", "0.333333", "nan"]
 
 
-def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
+def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one(tmp_path: Path) -> None:
     recording = synthetic.recording(12)
     assert recording.truth is not None
     names = [*EPCS, "on-a-shelf"]
@@ -136,6 +136,11 @@ def test_a_claim_of_a_tag_that_nothing_carries_is_a_false_one() -> None:
 
     traces = [(number, trace_of(number in (3, 4, 9))) for number in range(12)]
     result = score_traces(traces, recording, names)
+    write_frames(tmp_path / "frames.csv", {"one": [result]})
+    with (tmp_path / "frames.csv").open() as file:
+        on_shelf = [row for row in csv.DictReader(file) if row["epc"] == "on-a-shelf"]
+    assert [int(row["frame"]) for row in on_shelf if row["detected"] == "1"] == [3, 4, 9]
+    assert {(row["label"], row["iou"], row["valid"]) for row in on_shelf} == {("0", "nan", "0")}
     scores = result.scores().result()
     assert scores["p_fa"] == pytest.approx(3 / 12)
     of_labelled = [tag.result() for tag in result.tag_scores().values()]

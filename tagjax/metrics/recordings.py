@@ -35,6 +35,7 @@ class ScoreSettings(TraceSettings):
     min_pixels: int = 100  # objects with fewer visible pixels are not scored
     mask_level: float = 0.5  # threshold of soft masks
     num_pictures: int = 12  # overlay pictures a recording, evenly spread
+    video: bool = True  # an overlay video of each recording and tracer, which the report's page shows
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,16 +69,16 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class RecordingResult:
-    """Scores of every tag of one recording (none without truth), and the pictures kept.
+    """Scores of every tag of one recording whose object is labelled (none without truth), and the pictures kept.
 
-    `unlabelled` holds, for each tag whose object has no label (a tag on a shelf, say), the frames in which it was detected.
+    `unlabelled` holds what is known of the other tags, without truth: those on a shelf, say, or all if nothing is labelled.
     """
 
     recording: Recording
     frames: dict[str, FrameScores]
     pictures: list[Picture]
     settings: ScoreSettings
-    unlabelled: dict[str, Bool[np.ndarray, " time"]] = dataclasses.field(default_factory=dict)
+    unlabelled: dict[str, FrameScores] = dataclasses.field(default_factory=dict)
     multi_object: MultiObjectScores = dataclasses.field(default_factory=MultiObjectScores)
 
     def tag_scores(self) -> dict[str, Scores]:
@@ -93,8 +94,9 @@ class RecordingResult:
         total = Scores(multi_object=self.multi_object)
         for scores in self.tag_scores().values():
             total = total.merge(scores)
-        for detected in self.unlabelled.values():
-            total = total.merge(Scores.of_false_detections(detected))
+        # Where nothing is labelled, a detection is neither right nor false.
+        for frames in self.unlabelled.values() if self.frames else ():
+            total = total.merge(Scores.of_false_detections(frames.detected))
         return total
 
 
@@ -131,16 +133,26 @@ def evaluate_recording(
     settings: ScoreSettings | None = None,
     frames: tuple[int, int] | None = None,
     on_frame: Callable[[], None] | None = None,
+    on_picture: Callable[[Picture], None] | None = None,
 ) -> RecordingResult:
-    """Trace a recording and score every tag whose object is labelled; without truth only pictures are returned.
+    """Trace a recording and score every tag whose object is labelled; without truth there are pictures and detections only.
 
     Boxes and masks are compared at the size of the full picture. `stride` is that of `load`, None the one of the
-    picture's width (`working_stride`); `on_frame` is called after each frame.
+    picture's width (`working_stride`); `on_frame` is called after each frame, `on_picture` with the picture of each.
     """
     settings = settings or ScoreSettings()
     names = recording.resolve_epcs(epcs)
     trace = trace_recording(tracer, recording, load, epcs=names, settings=settings, frames=frames)
-    return score_traces(trace, recording, names, stride=stride, settings=settings, frames=frames, on_frame=on_frame)
+    return score_traces(
+        trace,
+        recording,
+        names,
+        stride=stride,
+        settings=settings,
+        frames=frames,
+        on_frame=on_frame,
+        on_picture=on_picture,
+    )
 
 
 def score_traces(
@@ -152,6 +164,7 @@ def score_traces(
     settings: ScoreSettings | None = None,
     frames: tuple[int, int] | None = None,
     on_frame: Callable[[], None] | None = None,
+    on_picture: Callable[[Picture], None] | None = None,
 ) -> RecordingResult:
     """`evaluate_recording` for given traces of the tags `names`, frame by frame (as `trace_recording` yields them)."""
     settings = settings or ScoreSettings()
@@ -161,7 +174,7 @@ def score_traces(
     truth = recording.truth if recording.truth is not None and recording.truth.labels is not None else None
     scored = {epc: truth.tag_to_label[epc] for epc in names if truth is not None and epc in truth.tag_to_label}
     kept = set(np.linspace(first, last - 1, settings.num_pictures).astype(int).tolist())
-    rows: dict[str, list[dict[str, Any]]] = {epc: [] for epc in scored}
+    rows: dict[str, list[dict[str, Any]]] = {epc: [] for epc in names}
     found_boxes: list[np.ndarray] = []
     detected: list[np.ndarray] = []
     pictures: list[Picture] = []
@@ -170,40 +183,58 @@ def score_traces(
         found_boxes.append(boxes)
         detected.append(np.asarray(trace.detected, bool))
         status = status_or_detected(trace.status, detected[-1])
+        drawn = number in kept or on_picture is not None
         masks = {
             tag: mask_to_picture(np.asarray(trace.mask[tag]), stride, height, width) >= settings.mask_level
             for tag, epc in enumerate(names)
-            if epc in scored or number in kept
+            if epc in scored or drawn
         }
+        labels = area_px = None
         if truth is not None and truth.labels is not None and scored:
             labels = np.asarray(truth.labels[number])
             area_px = labelled_area(labels)
-            for tag, epc in enumerate(names):
-                if epc not in scored:
-                    continue
-                row = _score_frame(masks[tag], boxes[tag], labels, scored[epc], area_px, settings)
-                row["confidence"] = float(trace.confidence[tag])
-                row["detected"] = bool(trace.detected[tag])
-                row["status"] = int(status[tag])
+        for tag, epc in enumerate(names):
+            row = {
+                "confidence": float(trace.confidence[tag]),
+                "detected": bool(trace.detected[tag]),
+                "status": int(status[tag]),
+            }
+            if truth is not None and labels is not None and area_px is not None and epc in scored:
+                row |= _score_frame(masks[tag], boxes[tag], labels, scored[epc], area_px, settings)
                 range_m = np.linalg.norm(np.asarray(trace.centre_m[tag], np.float64) - recording.antennas_m[0])
                 carrier_px = truth.carrier_box_px[epc][number] if epc in truth.carrier_box_px else np.full(4, np.nan)
                 known = bool(np.isfinite(carrier_px).all())
                 row["carrier_iou"] = float(box_iou(boxes[tag], carrier_px)) if known else float("nan")
                 row["range_error_m"] = float(range_m - _at(truth.tag_range_m, epc, number))
-                rows[epc].append(row)
-        if number in kept:
+            rows[epc].append(_UNSCORED | row)
+        if drawn:
             confidence = np.asarray(trace.confidence, np.float64)
             ordered = np.stack([masks[tag] for tag in range(len(names))])
-            pictures.append(Picture(number, tuple(names), ordered, boxes, confidence, detected[-1], status))
+            picture = Picture(number, tuple(names), ordered, boxes, confidence, detected[-1], status)
+            if number in kept:
+                pictures.append(picture)
+            if on_picture is not None:
+                on_picture(picture)
         if on_frame is not None:
             on_frame()
-    if truth is None or not scored:
-        return RecordingResult(recording, {}, pictures, settings)
-    tags = {epc: _tag_frames(recording, truth, epc, rows[epc], (first, last), settings) for epc in scored}
+    tags = {epc: _tag_frames(recording, truth, epc, rows[epc], (first, last), settings) for epc in names}
+    labelled = {epc: tags[epc] for epc in names if epc in scored}
+    unlabelled = {epc: tags[epc] for epc in names if epc not in scored}
+    if not labelled:
+        return RecordingResult(recording, {}, pictures, settings, unlabelled)
     found = np.stack(detected)
-    unlabelled = {epc: found[:, tag] for tag, epc in enumerate(names) if epc not in scored}
-    multi_object = MultiObjectScores.of(_match_frames(tags, rows, names, np.stack(found_boxes), found))
-    return RecordingResult(recording, tags, pictures, settings, unlabelled, multi_object)
+    multi_object = MultiObjectScores.of(_match_frames(labelled, rows, names, np.stack(found_boxes), found))
+    return RecordingResult(recording, labelled, pictures, settings, unlabelled, multi_object)
+
+
+_UNSCORED: dict[str, Any] = {
+    "true_box_px": np.full(4, np.nan),
+    **dict.fromkeys(("iou", "cle_px", "mask_j", "carrier_iou", "range_error_m"), float("nan")),
+    "boundary_f": np.full(len(BOUNDARY_PX) + 1, np.nan),
+    "identified": 0,
+    "visible": False,
+}
+"""A frame of a tag whose object has no label."""
 
 
 def _score_frame(
@@ -237,15 +268,17 @@ def _at(values: Mapping[Any, Any], key: Any, frame: int) -> float:
 
 def _tag_frames(
     recording: Recording,
-    truth: Truth,
+    truth: Truth | None,
     epc: str,
     rows: Sequence[Mapping[str, Any]],
     frames: tuple[int, int],
     settings: ScoreSettings,
 ) -> FrameScores:
-    part, label = slice(*frames), truth.tag_to_label[epc]
+    """A tag's frames; without truth, or a label of its object, no frame counts and the label is 0."""
+    truth = Truth() if truth is None else truth
+    part, label = slice(*frames), truth.tag_to_label.get(epc, 0)
     time_s, frame = recording.frame_time_s(), np.arange(recording.num_frames)
-    begin = first_motion(truth, epc, time_s, min_speed_m_s=settings.min_speed_m_s)
+    begin = first_motion(truth, epc, time_s, min_speed_m_s=settings.min_speed_m_s) if label else None
     since = np.full(len(frame), -len(frame)) if begin is None else frame - begin
     elapsed_s = time_s - (time_s[begin] if begin is not None else np.inf)
     until_s = np.inf if settings.until_s is None else settings.until_s

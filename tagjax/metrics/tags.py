@@ -53,7 +53,7 @@ class FrameScores:
     reads: Int[np.ndarray, " time"]  # of the last second
     rssi_dbm: Float[np.ndarray, " time"]  # mean of the last second, NaN without a read
     line_of_sight: Float[np.ndarray, " time"]  # fraction of the field on the direct path, NaN = unknown
-    label: int
+    label: int  # 0 = the object has no label
     moves: bool  # the tag moves at some time
 
     @property

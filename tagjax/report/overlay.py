@@ -8,25 +8,32 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Shaped, UInt8
 
+from ..metrics.boxes import label_box
+from ..metrics.recordings import Picture
+from ..recording import Recording
 from ..tracing.status import Status
 
 PALETTE_RGB = (
-    (255, 99, 71),
-    (64, 156, 255),
-    (80, 200, 120),
-    (255, 200, 40),
-    (190, 110, 255),
-    (0, 210, 210),
-    (255, 130, 200),
-    (170, 140, 90),
+    (230, 159, 0),
+    (86, 180, 233),
+    (213, 94, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (240, 228, 66),
+    (0, 114, 178),
+    (153, 153, 153),
 )
-"""Colours of tags in their order, distinguishable on dark and on bright pictures."""
+"""Colours of tags in their order: Okabe and Ito (2008), which people with any kind of colour vision distinguish, and grey."""
 
 _SIZE = 0.45
 """Font scale, as OpenCV counts it."""
 
 _LINE = 14
 """Line spacing of text, pixels."""
+
+_LUMA = (0.299, 0.587, 0.114)
+_BRIGHT = 110.0
+"""Brightness of a colour, 0 to 255, and from where on letters on it are black."""
 
 MIN_WIDTH = 480
 """Smaller pictures are enlarged by an integer factor, so that outlines and names stay readable."""
@@ -72,7 +79,7 @@ def draw_overlay(
     taken: list[tuple[int, int, int, int]] = []
     if caption:
         place = 6, picture.shape[0] - 8
-        _text(picture, caption, place, (255, 255, 255))
+        _text(picture, caption, place, (0, 0, 0))
         taken.append(_extent(caption, place))
     lines = range(_LINE, picture.shape[0] - 2 * _LINE, _LINE)  # as many as there is room for above the caption
     for y, (tag, text) in zip(lines, _missing(names, status), strict=False):
@@ -83,6 +90,28 @@ def draw_overlay(
         _text(picture, text, place, shade)
         taken.append(_extent(text, place))
     return picture
+
+
+def picture_overlay(recording: Recording, picture: Picture) -> UInt8[np.ndarray, "picture_height picture_width 3"]:
+    """The overlay of a tracer's output at one frame of a recording, with the true boxes where they are known."""
+    truth = recording.truth
+    true_boxes = np.full((len(picture.epcs), 4), np.nan)
+    if truth is not None and truth.labels is not None:
+        labels = np.asarray(truth.labels[picture.frame])
+        for tag, epc in enumerate(picture.epcs):
+            if epc in truth.tag_to_label:
+                true_boxes[tag] = label_box(labels, truth.tag_to_label[epc])
+    return draw_overlay(
+        np.asarray(recording.colour[picture.frame]),
+        [short_name(epc) for epc in picture.epcs],
+        picture.masks,
+        picture.boxes_px,
+        picture.confidence,
+        picture.detected,
+        status=picture.status,
+        true_boxes_px=true_boxes,
+        caption=f"frame {picture.frame}",
+    )
 
 
 def _missing(names: Sequence[str], status: Int8[np.ndarray, " tag"] | None) -> list[tuple[int, str]]:
@@ -116,14 +145,11 @@ def _free_place(
 
 
 def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
-    # A dark outline keeps letters readable on any background. It is drawn by shifts: thicker letters are also wider.
-    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        _letters(picture, text, (place[0] + dx, place[1] + dy), (0, 0, 0))
-    _letters(picture, text, place, shade)
-
-
-def _letters(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[int, int, int]) -> None:
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, shade, 1, cv2.LINE_AA)
+    """Black or white letters on a patch of the colour: video codecs blur colours, but not brightness."""
+    left, top, right, bottom = _extent(text, place)
+    cv2.rectangle(picture, (left - 2, top), (right, bottom), shade, cv2.FILLED)
+    letters = (0, 0, 0) if float(np.dot(shade, _LUMA)) > _BRIGHT else (255, 255, 255)
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, letters, 1, cv2.LINE_AA)
 
 
 def short_name(epc: str, length: int = 6) -> str:

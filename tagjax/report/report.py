@@ -1,4 +1,4 @@
-"""The report of an evaluation: metrics.json, frames.csv, overlay pictures and curves in one folder."""
+"""The files of a report in one folder: metrics.json, frames.csv, overlay pictures and curves."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rich.table import Table
 
 from ..core.names import plain_label, safe_file_name
 from ..core.results import write_csv, write_json
-from ..metrics.boxes import label_box
 from ..metrics.curves import motion_curves
 from ..metrics.interval import estimates
 from ..metrics.recordings import RecordingResult
 from ..metrics.tags import Scores
+from ..recording import Recording
 from ..recording.image_files import write_image
 from ..tracing.status import Status
-from .overlay import draw_overlay, short_name
+from .overlay import picture_overlay
 
 Results = Mapping[str, Sequence[RecordingResult]]
 """Results of each tracer, by name, one element a recording; the recordings are the same for all."""
@@ -35,6 +35,7 @@ _COLUMNS = (
     "detected",
     "status",
     "visible",
+    "valid",
     "since_motion",
     "reads",
     "rssi_dbm",
@@ -48,10 +49,11 @@ def summarise(results: Results) -> dict[str, Any]:
     for tracer, ones in results.items():
         total = Scores()
         recordings: dict[str, Any] = {}
+        names = recording_names([one.recording for one in ones])
         for number, one in enumerate(ones):
             total = total.merge(one.scores())
             tags = {epc: scores.result() for epc, scores in one.tag_scores().items()}
-            recordings[_recording_name(ones, number)] = {"all": one.scores().result(), "tags": tags}
+            recordings[names[number]] = {"all": one.scores().result(), "tags": tags}
         whole = estimates([one.scores().means for one in ones])
         intervals = {name: [one.low, one.high] for name, one in whole.items() if one.low is not None}
         summary[tracer] = {"all": total.result(), "intervals": intervals, "recordings": recordings}
@@ -64,25 +66,23 @@ def write_report(folder: Path, results: Results) -> dict[str, Any]:
     write_json(folder / "metrics.json", summary)
     write_frames(folder / "frames.csv", results)
     for tracer, ones in results.items():
+        names = recording_names([one.recording for one in ones])
         for number, one in enumerate(ones):
-            write_overlays(
-                folder / "overlays" / safe_file_name(_recording_name(ones, number)) / safe_file_name(tracer), one
-            )
+            write_overlays(overlay_folder(folder, names[number], tracer), one)
     write_curves(folder / "curves", results)
     write_motion_curves(folder, results)
     return summary
 
 
 def write_frames(path: Path, results: Results) -> None:
-    """One CSV row for each tracer, recording, tag and frame."""
+    """One CSV row for each tracer, recording, tag and frame; of a tag whose object has no label (0), scores are NaN."""
     write_csv(path, ("tracer", "recording", "epc", "label", "frame", "time_s", *_COLUMNS), _frame_rows(results))
 
 
 def _frame_rows(results: Results) -> Iterator[tuple[Any, ...]]:
     for tracer, ones in results.items():
-        for number, one in enumerate(ones):
-            name = _recording_name(ones, number)
-            for epc, frames in one.frames.items():
+        for name, one in zip(recording_names([one.recording for one in ones]), ones, strict=True):
+            for epc, frames in (one.frames | one.unlabelled).items():
                 offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
                 for index, time_s in enumerate(frames.time_s):
                     written = [_written(column, getattr(frames, column)[index]) for column in _COLUMNS]
@@ -97,26 +97,8 @@ def _written(column: str, value: Any) -> str | int:
 
 def write_overlays(folder: Path, result: RecordingResult) -> None:
     """One PNG for each kept frame; true boxes are thin and white. Tags that are not detected are listed with the reason."""
-    truth = result.recording.truth
     for picture in result.pictures:
-        true_boxes = np.full((len(picture.epcs), 4), np.nan)
-        if truth is not None and truth.labels is not None:
-            labels = np.asarray(truth.labels[picture.frame])
-            for tag, epc in enumerate(picture.epcs):
-                if epc in truth.tag_to_label:
-                    true_boxes[tag] = label_box(labels, truth.tag_to_label[epc])
-        drawn = draw_overlay(
-            np.asarray(result.recording.colour[picture.frame]),
-            [short_name(epc) for epc in picture.epcs],
-            picture.masks,
-            picture.boxes_px,
-            picture.confidence,
-            picture.detected,
-            status=picture.status,
-            true_boxes_px=true_boxes,
-            caption=f"frame {picture.frame}",
-        )
-        write_image(folder / f"frame{picture.frame:06d}.png", drawn)
+        write_image(folder / f"frame{picture.frame:06d}.png", picture_overlay(result.recording, picture))
 
 
 def write_curves(folder: Path, results: Results) -> None:
@@ -130,6 +112,7 @@ def write_curves(folder: Path, results: Results) -> None:
         )
         return
     reference = next(iter(results.values()), ())
+    names = recording_names([one.recording for one in reference])
     for number, one in enumerate(reference):
         for epc, frames in one.frames.items():
             lines = {}
@@ -139,7 +122,7 @@ def write_curves(folder: Path, results: Results) -> None:
                     "iou": np.where(own.detected, own.iou, 0.0),
                     "cle_px": np.where(own.detected & own.visible, own.cle_px, np.nan),
                 }
-            name = _recording_name(reference, number)
+            name = names[number]
             offset = int(np.searchsorted(one.recording.frame_time_s(), frames.time_s[0]))
             path = folder / f"{safe_file_name(f'{name}_{epc}')}.png"
             score_curves(path, lines, frames.valid, first_frame=offset, title=plain_label(f"{name}: {epc}"))
@@ -197,7 +180,12 @@ def _cell(value: float | int | None) -> str:
     return f"{value:.3f}" if 0 < abs(value) < 1 else f"{value:.3g}"
 
 
-def _recording_name(results: Sequence[RecordingResult], number: int) -> str:
-    """The recording's own name, numbered where several share it."""
-    names = [one.recording.name for one in results]
-    return names[number] if names.count(names[number]) == 1 else f"{names[number]}-{number}"
+def recording_names(recordings: Sequence[Recording]) -> list[str]:
+    """The recordings' own names, numbered where several share one."""
+    names = [one.name for one in recordings]
+    return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names)]
+
+
+def overlay_folder(folder: Path, recording: str, tracer: str) -> Path:
+    """Where a report keeps the overlay pictures and the video of a recording's name and a tracer."""
+    return folder / "overlays" / safe_file_name(recording) / safe_file_name(tracer)

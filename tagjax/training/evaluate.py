@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,8 +14,10 @@ from rich.progress import track
 from ..core.settings import ConfigError, changed
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
-from ..report.report import write_report
-from ..tracing.clips import Antennas, ClipSettings, clip_loader
+from ..report.report import overlay_folder, recording_names, write_report
+from ..report.stages import stage_picture, write_stages
+from ..report.video import overlay_video
+from ..tracing.clips import Antennas, ClipSettings, clip_loader, window_frames
 from ..tracing.tracer import AbstractTracer
 
 
@@ -71,16 +74,32 @@ def evaluate_tracers(
     labels = {name: f"{name}_smoothed" if name in smoothed else name for name in tracers}
     work = [(name, number) for name in tracers for number in range(len(recordings))]
     results: dict[str, list[RecordingResult]] = {labels[name]: [] for name in tracers}
+    names = recording_names(recordings)
     for name, number in track(work, description="evaluate", disable=not progress):
-        results[labels[name]].append(
-            evaluate_recording(
+        recording, own = recordings[number], settings.supported_by(tracers[name])
+        kept = overlay_folder(folder, names[number], labels[name])
+        with overlay_video(kept, recording) if own.video else contextlib.nullcontext() as on_picture:
+            result = evaluate_recording(
                 tracers[name],
-                recordings[number],
+                recording,
                 clip_loader(chosen[name]),
                 stride=chosen[name].stride,
                 epcs=epcs,
-                settings=settings.supported_by(tracers[name]),
+                settings=own,
                 frames=frames,
+                on_picture=on_picture,
             )
-        )
+        results[labels[name]].append(result)
+        _write_stages(kept, result, chosen[name], 0 if frames is None else frames[0])
     return write_report(folder, results)
+
+
+def _write_stages(folder: Path, result: RecordingResult, clips: ClipSettings, first: int) -> None:
+    """Write the stages of one kept picture, with the inputs that the tracer had."""
+    recording = result.recording
+    window = clips.window if clips.window_s is None else window_frames(clips.window_s, recording.frame_rate_hz)
+    picture = stage_picture(result.pictures, first + window - 1)
+    if picture is not None:
+        start = max(first, picture.frame - window + 1)
+        clip = clip_loader(clips)(recording, start, picture.frame + 1, epcs=picture.epcs)
+        write_stages(folder, recording, picture, clip.camera, clip.frames)
