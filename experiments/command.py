@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -72,11 +73,15 @@ def checked(schema: type[T], values: Mapping[str, Any], folder: Path) -> T:
 
 
 def write_config(values: Mapping[str, Any], folder: Path) -> None:
-    """Write config.yaml into the run folder. The file appears whole or not at all."""
+    """Write config.yaml and run.json (command, versions, machine) into the run folder. Each appears whole or not at all."""
     from tagjax.core.files import atomic_path
+    from tagjax.core.run_record import write_run_record
 
     with atomic_path(folder / "config.yaml") as partial:
         OmegaConf.save(OmegaConf.create(dict(values)), partial)
+    if HydraConfig.initialized():
+        job = HydraConfig.get()
+        write_run_record(folder, shlex.join(["python", "-m", f"experiments.{job.job.name}", *job.overrides.task]))
 
 
 def print_result(result: Any) -> None:
