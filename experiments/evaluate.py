@@ -32,6 +32,7 @@ def main(values: dict[str, Any], folder: Path) -> float:
 
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.run import EvaluateConfig, run_evaluation
+    from tagjax.report.page import PAGE
     from tagjax.report.report import score_table
 
     suite, options = values.pop("suite", None), {key: values.pop(key) for key in ("max_recordings", "smoke")}
@@ -42,7 +43,7 @@ def main(values: dict[str, Any], folder: Path) -> float:
         config = from_mapping(EvaluateConfig, values)
     write_config(values, folder)
     summary = run_evaluation(config, folder, run_values=run_configuration(config.run))
-    Console(markup=False).print(score_table(summary, title=f"report: {folder}"))
+    Console(markup=False).print(score_table(summary, title=f"report: {folder / PAGE}"))
     print_result(summary)
     iou = next(iter(summary.values()))["all"].get("iou")
     return float("nan") if iou is None else float(iou)

@@ -129,3 +129,11 @@ def check_gradients(function, arguments, *, atol: float = 1e-6, rtol: float = 1e
 def gradients_agree():
     """`check_gradients`, for tests."""
     return check_gradients
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of an evaluation, for the tests of its page, which write nothing into it."""
+    from report_runs import report_run
+
+    return report_run(tmp_path_factory.mktemp("run"))

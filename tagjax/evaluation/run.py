@@ -11,6 +11,7 @@ from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
 from ..recording.loading import VirtualTagSettings, open_recordings
+from ..report.page import write_page
 from ..tagattention.tracer_settings import baseline_clips, learned_tracer, make_tracer, tracer_clips
 from ..tracing.clips import ClipSettings
 from ..training.checkpoint import Checkpoints
@@ -78,7 +79,7 @@ def run_evaluation(
             "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with validation recordings."
         )
     tracers |= {name: make_tracer(settings) for name, settings in baselines.items()}
-    return evaluate_tracers(
+    summary = evaluate_tracers(
         tracers,
         recordings,
         folder,
@@ -89,6 +90,8 @@ def run_evaluation(
         frames=config.frames,
         progress=config.progress,
     )
+    write_page(folder)
+    return summary
 
 
 @dataclasses.dataclass(frozen=True)

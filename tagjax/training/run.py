@@ -17,6 +17,7 @@ from ..core.folder_lock import locked_folder
 from ..core.interruption import interruption
 from ..core.results import to_json_values, write_json
 from ..recording import Recording
+from ..report.page import PAGE, write_page
 from ..report.report import score_table
 from ..tagattention.learned import LearnableTracer, save_parameters
 from ..tagattention.tracer_settings import baseline_clips, make_tracer
@@ -74,8 +75,9 @@ def run_training(
     """Train as configured, evaluate on the validation recordings, and return the objective of a sweep, to be maximised.
 
     The objective is the mean box IoU on the validation recordings if they are labelled, else the masks' overlap with the
-    smoother's, or, without hindsight, the coherence of the reads with the masks' motion; NaN without validation recordings. `folder` then holds checkpoints, metrics.jsonl, the learned
-    parameters (weights.json, parameters.json, flow.safetensors), and with validation recordings metrics.json and report/.
+    smoother's, or, without hindsight, the coherence of the reads with the masks' motion; NaN without validation
+    recordings. `folder` then holds checkpoints, metrics.jsonl, the learned parameters (weights.json, parameters.json,
+    flow.safetensors), and with validation recordings metrics.json, report/ and the page report.html.
     Ctrl-C and SIGTERM make it write a checkpoint and raise `KeyboardInterrupt` or `Terminated`; the run resumes when it is
     started again in the same folder. With several processes (`config.distributed`) process 0 writes and evaluates; the
     others return NaN. The process that writes holds the folder's lock from before `on_start`, which writes what the caller
@@ -122,6 +124,7 @@ def _run(
     finally:
         logger.close()
     console.print(score_table(summary, title="validation recordings"))
+    console.print(f"report: {folder / PAGE}", soft_wrap=True, highlight=False)
     iou = learned["all"].get("iou")
     if iou is None:
         iou = validation_metrics(trained.state, data.held_out, config).get(data.score, float("nan"))
@@ -219,6 +222,7 @@ def _report(
         progress=config.loop.progress,
     )
     write_json(folder / "metrics.json", summary)
+    write_page(folder)
     return summary
 
 

@@ -1,0 +1,4 @@
+"""The report of a run as one self-contained HTML page."""
+
+from .page import PAGE as PAGE
+from .page import write_page as write_page
