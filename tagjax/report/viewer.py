@@ -1,0 +1,181 @@
+"""A traced recording in the Rerun viewer: pictures, masks, boxes, depth, reads and evidence on one timeline."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..core.camera import working_stride
+from ..core.settings import ConfigError
+from ..recording import Recording
+from ..tracing.clips import subsampled_depth
+from ..tracing.status import Status, status_or_detected
+from ..tracing.tracer import Trace
+from .overlay import PALETTE_RGB, short_name
+
+_JPEG_QUALITY = 70
+_TIME = "time"
+
+
+def rerun() -> Any:
+    """The module `rerun`. Raises `ConfigError` where it is not installed."""
+    try:
+        import rerun as module
+    except ImportError as error:
+        raise ConfigError(
+            'the viewer needs rerun-sdk, which is not installed: pip install -c constraints.txt -e ".[viewer]"'
+        ) from error
+    return module
+
+
+def log_recording(
+    recording: Recording,
+    traces: Iterator[tuple[int, Trace]],
+    epcs: Sequence[str],
+    antennas: Sequence[int],
+    *,
+    stride: int | None,
+    depth: bool,
+    out: Path | None,
+) -> None:
+    """Log every frame with its trace, frame by frame, to the file `out`, or to a viewer that is opened.
+
+    `epcs` and `antennas` (counted from 1) are those of the traces. Times are seconds since the first frame. With `depth`
+    each frame has its depth as well, which viewers show as points in space; without it a file is a tenth of the size.
+    """
+    rr = rerun()
+    stream = rr.RecordingStream("tagjax")
+    stream.send_blueprint(_blueprint())
+    if out is None:
+        stream.spawn()
+    else:
+        stream.save(str(out))
+    stride = working_stride(recording.intrinsics.width, stride)
+    _log_scene(rr, stream, recording, epcs, antennas, stride)
+    _log_reads(rr, stream, recording, epcs, antennas)
+    try:
+        for number, trace in traces:
+            stream.set_time(_TIME, duration=float(recording.frame_time_s()[number]))
+            _log_picture(rr, stream, recording, number, stride, depth=depth)
+            _log_trace(rr, stream, recording, trace, epcs, antennas, stride)
+    finally:
+        stream.flush()
+        stream.disconnect()
+
+
+def _blueprint() -> Any:
+    from rerun import blueprint as view
+
+    curves = [
+        view.TimeSeriesView(origin=f"/{name}", name=title)
+        for name, title in (
+            ("phase", "phase of the reads, rad"),
+            ("distance", "distance to the antenna, m"),
+            ("confidence", "confidence"),
+        )
+    ]
+    return view.Blueprint(
+        view.Horizontal(
+            view.Vertical(
+                view.Spatial2DView(origin="/camera/picture", name="picture"),
+                view.Spatial3DView(origin="/", contents=["/camera/**", "/antennas", "/places/**"], name="space"),
+            ),
+            view.Vertical(*curves, view.TextLogView(origin="/status", name="status")),
+        ),
+        collapse_panels=True,
+    )
+
+
+def _log_scene(
+    rr: Any, stream: Any, recording: Recording, epcs: Sequence[str], antennas: Sequence[int], stride: int
+) -> None:
+    """What does not change: names and colours of tags, the antennas, the camera."""
+    classes = [(0, "no tag", (0, 0, 0, 0))]
+    classes += [(tag + 1, epc, PALETTE_RGB[tag % len(PALETTE_RGB)]) for tag, epc in enumerate(epcs)]
+    stream.log("/", rr.AnnotationContext(classes), static=True)
+    stream.log("/", rr.ViewCoordinates.RDF, static=True)
+    places = recording.antennas_m[np.asarray(antennas) - 1]
+    names = [f"antenna {number}" for number in antennas]
+    stream.log("/antennas", rr.Points3D(places, labels=names, radii=0.03, colors=(200, 200, 200)), static=True)
+    for name, one in (("picture", recording.intrinsics), ("depth", recording.intrinsics.scaled(stride))):
+        pinhole = rr.Pinhole(
+            focal_length=(one.fx_px, one.fy_px),
+            principal_point=(one.cx_px, one.cy_px),
+            width=one.width,
+            height=one.height,
+            image_plane_distance=0.4,
+        )
+        stream.log(f"/camera/{name}", pinhole, static=True)
+    for tag, epc in enumerate(epcs):
+        colour = PALETTE_RGB[tag % len(PALETTE_RGB)]
+        for name in ("distance", "confidence"):
+            stream.log(_of(epc, name), rr.SeriesLines(colors=colour, names=short_name(epc)), static=True)
+        points = rr.SeriesPoints(colors=colour, names=short_name(epc), marker_sizes=3)
+        stream.log(_of(epc, "phase"), points, static=True)
+        stream.log(_of(epc, "rssi"), points, static=True)
+
+
+def _log_reads(rr: Any, stream: Any, recording: Recording, epcs: Sequence[str], antennas: Sequence[int]) -> None:
+    """Each read at its own time."""
+    for epc in epcs:
+        reads = recording.reads.select(epc)
+        reads = reads[np.isin(reads.antenna, np.asarray(antennas))]
+        time_s = (reads.time_ns - recording.time_ns[0]) * 1e-9
+        index = [rr.TimeColumn(_TIME, duration=time_s)]
+        for name, values in (("phase", reads.phase_rad), ("rssi", reads.rssi_dbm)):
+            stream.send_columns(
+                _of(epc, name), indexes=index, columns=rr.Scalars.columns(scalars=np.asarray(values, float))
+            )
+
+
+def _log_picture(rr: Any, stream: Any, recording: Recording, number: int, stride: int, *, depth: bool) -> None:
+    bgr = np.asarray(recording.colour[number])[..., ::-1]
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    stream.log("/camera/picture", rr.EncodedImage(contents=encoded.tobytes(), media_type="image/jpeg"))
+    if depth and recording.depth_kind == "depth":
+        metres = subsampled_depth(recording.depth_metres(slice(number, number + 1)), stride)[0]
+        stream.log("/camera/depth", rr.DepthImage(np.round(1e3 * metres).astype(np.uint16), meter=1000.0))
+
+
+def _log_trace(
+    rr: Any,
+    stream: Any,
+    recording: Recording,
+    trace: Trace,
+    epcs: Sequence[str],
+    antennas: Sequence[int],
+    stride: int,
+) -> None:
+    detected = np.asarray(trace.detected)
+    numbers = np.flatnonzero(detected)
+    height, width = recording.intrinsics.height, recording.intrinsics.width
+    labels = np.zeros((height, width), np.uint8)
+    for tag in numbers:
+        mask = np.asarray(trace.mask[tag]) > 0.5
+        labels[mask.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]] = tag + 1
+    stream.log("/camera/picture/masks", rr.SegmentationImage(labels, opacity=0.5))
+    boxes = np.asarray(trace.box_px)[numbers] * stride
+    names = [f"{short_name(epcs[tag])} {trace.confidence[tag]:.2f}" for tag in numbers.tolist()]
+    box = rr.Boxes2D(array=boxes, array_format=rr.Box2DFormat.XYXY, labels=names, class_ids=numbers + 1)
+    stream.log("/camera/picture/boxes", box)
+    places = np.asarray(trace.centre_m)
+    for tag, epc in enumerate(epcs):
+        stream.log(_of(epc, "confidence"), rr.Scalars(float(trace.confidence[tag])))
+        if not detected[tag]:
+            stream.log(f"/places/{epc}", rr.Clear(recursive=False))
+            continue
+        colour = PALETTE_RGB[tag % len(PALETTE_RGB)]
+        stream.log(f"/places/{epc}", rr.Points3D([places[tag]], labels=[short_name(epc)], radii=0.04, colors=colour))
+        metres = np.linalg.norm(places[tag] - recording.antennas_m[antennas[0] - 1])
+        stream.log(_of(epc, "distance"), rr.Scalars(float(metres)))
+    status = status_or_detected(trace.status, trace.detected)
+    words = ", ".join(f"{short_name(epc)} {Status(int(code)).text}" for epc, code in zip(epcs, status, strict=True))
+    stream.log("/status", rr.TextLog(words))
+
+
+def _of(epc: str, name: str) -> str:
+    return f"/{name}/{epc}"
