@@ -15,6 +15,7 @@ import pytest
 from test_segment_tracer import EPCS, scene
 
 from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.metrics.locking import first_motion
 from tagjax.recording import Recording, RecordingError, TagReads
 from tagjax.recording.store import save_recording
 from tagjax.tagattention.segments import Segmenter, SegmentTracker, TagAttention
@@ -67,6 +68,31 @@ def test_targets_are_the_smoothers_masks(piece: Piece) -> None:
     assert frames.target.shape == (96, 2, 256)
     assert not np.any(frames.present[70:])
     assert np.all(np.diff(frames.time_s) > 0)
+
+
+def test_labels_teach_from_the_first_motion_on_and_only_what_is_seen() -> None:
+    one = scene(40)
+    truth = one.truth
+    assert truth is not None
+    assert truth.labels is not None
+    labels = np.array(truth.labels)
+    labels[30:][labels[30:] == next(iter(EPCS.values()))] = 0  # out of the picture
+    began = {epc: first_motion(truth, epc, one.frame_time_s()) for epc in EPCS}
+    truth = dataclasses.replace(truth, labels=labels)
+    (piece,) = segment_pieces(
+        dataclasses.replace(one, truth=truth), TRACER, LOAD, epcs=list(EPCS), num_frames=64, teacher="labels"
+    )
+    frames = piece.frames
+    inside = np.einsum("ntk,nk->nt", frames.target, frames.found.area)[:40]
+    for tag, (epc, label) in enumerate(EPCS.items()):
+        np.testing.assert_allclose(inside[:, tag], np.sum(labels == label, axis=(1, 2)), rtol=0.05)
+        seen = np.any(labels == label, axis=(1, 2))
+        expected = np.where(~seen, 0.0, np.where(np.arange(40) < began[epc], 0.5, 1.0))
+        np.testing.assert_array_equal(frames.confidence[:40, tag], expected)
+    assert not np.all(frames.confidence[:40, 0] == 1.0)
+    none = dataclasses.replace(one, truth=None)
+    with pytest.raises(RecordingError, match="found no true mask of .*; expected labels of every tag"):
+        list(segment_pieces(none, TRACER, LOAD, epcs=list(EPCS), teacher="labels"))
 
 
 def test_the_loss_is_that_of_the_masks(piece: Piece) -> None:
@@ -214,7 +240,7 @@ def test_a_run_learns_and_resumes(tmp_path: Path) -> None:
 def test_what_cannot_teach_is_reported_before_the_training(tmp_path: Path) -> None:
     one = scene(40)
     silent = dataclasses.replace(one, reads=_few(one.reads))
-    with pytest.raises(RecordingError, match=r"hindsight: the smoother is sure .* of no tag in any of 1 recordings"):
+    with pytest.raises(RecordingError, match=r"hindsight: found no mask with a confidence above 0\.9 in any of 1 rec"):
         _run([_stored(silent, tmp_path / "silent.zarr")], tmp_path / "run")
     literal = {"_target_": "tagjax.tagattention.literal.TagAttentionLiteral", "softness": 0.3}
     with pytest.raises(

@@ -101,22 +101,23 @@ def _pieces(
     found = {}
     with Progress(*columns, console=console, disable=not config.loop.progress) as progress:
         for kind, recordings in (("training", training), ("validation", validation)):
-            task = progress.add_task(f"smoothed {kind} recordings", total=len(recordings))
+            task = progress.add_task(f"{kind} recordings, segments and masks", total=len(recordings))
             found[kind] = PieceFiles(folder / "pieces" / kind).made(
                 recordings,
                 tracer,
                 clip_loader(config.data.clips),
                 epcs=config.data.clips.epcs,
                 num_frames=settings.piece_frames,
+                teacher=settings.teacher,
                 on_progress=lambda done, task=task: progress.update(task, completed=done),
             )
     files, sure = found["training"], found["training"].num_sure(settings)
     if not sure:
         raise RecordingError(
-            f"hindsight: the smoother is sure (confidence above {settings.sure}) of no tag in any of {len(training)} "
-            "recordings, so there is nothing to learn. Give recordings in which tags move and are read."
+            f"hindsight: found no mask with a confidence above {settings.sure} in any of {len(training)} recordings (teacher: "
+            f"{settings.teacher}), so there is nothing to learn. Give recordings in which tags move and are read."
         )
-    console.print(f"The smoother is sure of a tag in {sure} tag-frames of {len(files)} pieces.")
+    console.print(f"{sure} masks to learn from, in {len(files)} pieces of recordings (teacher: {settings.teacher}).")
     batch_size = config.loop.batch_size or len(files)
     dataset = grain.MapDataset.source(files)
     if batch_size < len(files):

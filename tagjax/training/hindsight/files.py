@@ -23,6 +23,7 @@ from ...tracing.clips import selected_tags
 from ...tracing.tracer import Camera
 from .objective import HindsightSettings
 from .pieces import Piece, PieceFrames, segment_pieces
+from .teachers import Teacher
 
 _INDEX = "index.json"
 _NESTED: Mapping[str, type] = {"found": SegmentFrame, "arrivals": Arrivals, "radio": RadioWindow}
@@ -42,6 +43,7 @@ class PieceFiles:
         *,
         epcs: Sequence[str] | None,
         num_frames: int,
+        teacher: Teacher = "smoother",
         on_progress: Callable[[int], None] = lambda done: None,
     ) -> PieceFiles:
         """The folder with the pieces of all recordings; those that it holds already are not computed again.
@@ -52,7 +54,7 @@ class PieceFiles:
         on_progress(len(self._index()))
         for recording in recordings[len(self._index()) :]:
             tags, names, index = selected_tags(recording, epcs), [], self._index()
-            for piece in segment_pieces(recording, tracer, load, epcs=tags, num_frames=num_frames):
+            for piece in segment_pieces(recording, tracer, load, epcs=tags, num_frames=num_frames, teacher=teacher):
                 names.append(f"{len(index):04d}-{len(names):03d}.safetensors")
                 _write(self.folder / names[-1], piece)
             write_json(self.folder / _INDEX, [*index, names])
@@ -60,7 +62,7 @@ class PieceFiles:
         return self
 
     def num_sure(self, settings: HindsightSettings) -> int:
-        """The number of tag-frames in which the smoother is sure of a mask."""
+        """The number of tag-frames in which the teacher is sure of a mask."""
         return sum(int(np.sum(one.frames.present & (one.frames.confidence > settings.sure))) for one in self)
 
     def __len__(self) -> int:

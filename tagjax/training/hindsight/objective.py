@@ -16,6 +16,7 @@ from ...tagattention.segments import TagAttention
 from ...tracing.tracer import AbstractTracer, Camera
 from ..fading import faded
 from .pieces import PieceFrames, frame_of
+from .teachers import Teacher
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,11 +24,12 @@ class HindsightSettings:
     """Settings of learning from hindsight."""
 
     sure: float = (
-        0.9  # the smoother's mask counts where its confidence is above this, its silence where below 1 minus this
+        0.9  # a mask counts where the teacher's confidence is above this, its silence where below 1 minus this
     )
     memory: float = 0.9  # fraction of the gradient that a frame passes to the frame before
     clip_norm: float = 0.3  # of a piece's gradient, at most: some have 50 times the median
     piece_frames: int = 256  # a recording is cut into pieces of at most so many frames
+    teacher: Teacher = "smoother"  # or labels: the true masks of simulated recordings, to compare with
     term_norms: ClassVar[bool] = False  # there is one term
 
     def __post_init__(self) -> None:
@@ -65,7 +67,7 @@ class HindsightSettings:
 def hindsight_sums(
     tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Sums over the tag-frames of which the smoother is sure, and their numbers.
+    """Sums over the tag-frames of which the teacher is sure, and their numbers.
 
     Where it sees the object: 1 - soft IoU of its mask with the tracer's mask times confidence, on segments weighted by
     their areas. Where it sees none: the tracer's confidence.

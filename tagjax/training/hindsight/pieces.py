@@ -18,8 +18,9 @@ from ...recording import Recording
 from ...tagattention.segments import SegmentFrame, TagAttention
 from ...tagattention.segments.outline import filled_labels
 from ...tagattention.segments.state import last_s
-from ...tracing.recordings import TraceSettings, run_tracer, trace_recording
+from ...tracing.recordings import TraceSettings, run_tracer
 from ...tracing.tracer import Camera, Frame
+from .teachers import Teacher, smoother_masks, true_masks
 
 _FRAMES = 32
 """Pieces are padded to a multiple of so many frames, so that few programs are compiled."""
@@ -34,8 +35,8 @@ class PieceFrames(eqx.Module):
     arrivals: Arrivals  # (time, reads)
     radio: RadioWindow  # (time, tag, antenna, window)
     present: Bool[Array, "time tag"]
-    target: Float[Array, "time tag segment"]  # the part of the segment that lies in the smoother's mask
-    confidence: Float[Array, "time tag"]  # of the smoother
+    target: Float[Array, "time tag segment"]  # the part of the segment that lies in the teacher's mask
+    confidence: Float[Array, "time tag"]  # of the teacher
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,26 +73,30 @@ def segment_pieces(
     *,
     epcs: Sequence[str],
     num_frames: int = 256,
+    teacher: Teacher = "smoother",
 ) -> Iterator[Piece]:
     """The recording in pieces of at most `num_frames` frames of about equal length, in order of time.
 
-    `tracer` gives the segments and, smoothed over the whole recording, the masks to learn from; `load` is as in
-    `trace_recording`. The number of tags is padded to a power of two.
+    `tracer` gives the segments and, smoothed over the whole recording, the masks to learn from; with `teacher` labels these
+    are the true ones. `load` is as in `trace_recording`. The number of tags is padded to a power of two.
     """
     if num_frames < 1:
         raise ValueError(f"num_frames is {num_frames}; expected at least 1 frame a piece.")
     settings = TraceSettings(tags_at_once=len(epcs))
-    taught = trace_recording(tracer, recording, load, epcs=epcs, settings=dataclasses.replace(settings, smooth=True))
     seen = run_tracer(_segments_step, tracer, recording, load, epcs, settings, (0, recording.num_frames))
     count = -(-recording.num_frames // num_frames)
     ends = set(np.linspace(0, recording.num_frames, count + 1).astype(int)[1:].tolist())
     camera = load(recording, 0, 1, epcs=list(epcs)).camera
+    if teacher == "labels":
+        taught = true_masks(recording, camera.rays.shape[:2], epcs)
+    else:
+        taught = smoother_masks(tracer, recording, load, epcs)
     rows: list[Any] = []
-    for (number, trace), (_, (outputs,)) in zip(taught, seen, strict=True):
+    for (mask, confidence), (number, (outputs,)) in zip(taught, seen, strict=True):
         found, filled, time_s, depth_m, arrivals, radio = outputs
-        target = _overlap(np.asarray(trace.mask) > 0.5, filled, found.area.shape[0])
+        target = _overlap(mask, filled, found.area.shape[0])
         there = np.ones(len(epcs), bool)
-        rows.append((time_s, depth_m, found, arrivals, radio, there, target, trace.confidence))
+        rows.append((time_s, depth_m, found, arrivals, radio, there, target, confidence))
         if number + 1 in ends:
             yield Piece(camera, _padded(rows), recording.name, number + 1 - len(rows), len(rows))
             rows = []
