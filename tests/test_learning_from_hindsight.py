@@ -91,7 +91,7 @@ def test_labels_teach_from_the_first_motion_on_and_only_what_is_seen() -> None:
         np.testing.assert_array_equal(frames.confidence[:40, tag], expected)
     assert not np.all(frames.confidence[:40, 0] == 1.0)
     none = dataclasses.replace(one, truth=None)
-    with pytest.raises(RecordingError, match="found no true mask of .*; expected labels of every tag"):
+    with pytest.raises(RecordingError, match=r"found no true mask of .*; expected labels of every tag"):
         list(segment_pieces(none, TRACER, LOAD, epcs=list(EPCS), teacher="labels"))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
+from ..recording.controls import Control, with_control
 from ..recording.loading import VirtualTagSettings, open_recordings
 from ..report.page import write_page
 from ..tagattention.tracer_settings import baseline_clips, learned_tracer, make_tracer, tracer_clips
@@ -73,7 +74,7 @@ def run_evaluation(
         )
     clips = changed(clips, config.clips, where="clips")
     epcs = clips.epcs if config.epcs is None else config.epcs
-    recordings += open_recordings(config.recordings, config.virtual_tag)
+    recordings = with_control(recordings + open_recordings(config.recordings, config.virtual_tag), config.control)
     if not recordings:
         raise ConfigError(
             "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with validation recordings."
@@ -110,6 +111,7 @@ class EvaluateConfig:
     )  # override those of the run, the weights or the tracer
     baselines: Mapping[str, Mapping[str, Any]] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+    control: Control | None = None  # reads that do not belong to what is seen: every detection is a false one
     scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # override those of the run
     progress: bool = True
 

@@ -12,6 +12,7 @@ import numpy as np
 from ..core.errors import RecordingError
 from ..core.settings import ConfigError, from_mapping
 from ..radio.reader import ReaderSettings
+from .controls import Control, with_control
 from .image_files import read_labels
 from .reads import join_reads
 from .recording import Recording, Truth
@@ -40,9 +41,14 @@ class VirtualTagSettings:
             )
 
 
-def open_recordings(paths: Sequence[str], virtual_tag: VirtualTagSettings) -> list[Recording]:
-    """The recordings at these paths, with virtual tags if tracks are given. Errors as of `open_recording`."""
-    return [with_virtual_tags(open_recording(path), virtual_tag) for path in paths]
+def open_recordings(
+    paths: Sequence[str], virtual_tag: VirtualTagSettings, control: Control | None = None
+) -> list[Recording]:
+    """The recordings at these paths, with virtual tags if tracks are given, or with the reads of a control.
+
+    Errors as of `open_recording` and `with_control`.
+    """
+    return with_control([with_virtual_tags(open_recording(path), virtual_tag) for path in paths], control)
 
 
 def with_virtual_tags(recording: Recording, settings: VirtualTagSettings) -> Recording:

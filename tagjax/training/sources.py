@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ..core.settings import ConfigError
 from ..recording import Recording, RecordingError
+from ..recording.controls import Control
 from ..recording.loading import VirtualTagSettings, open_recordings
 from ..tracing.clips import ClipSettings
 
@@ -19,6 +20,7 @@ class DataSettings:
     validation: tuple[str, ...] = ()
     clips: ClipSettings = dataclasses.field(default_factory=ClipSettings)
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
+    control: Control | None = None  # training on reads that do not belong to what is seen, which must teach nothing
 
 
 def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recording]]:
@@ -45,7 +47,8 @@ def training_recordings(data: DataSettings) -> tuple[list[Recording], list[Recor
         raise RecordingError(
             f"{', '.join(sorted(twice))}: found in both data.recordings and data.validation; expected it in one of them."
         )
-    return open_recordings(data.recordings, data.virtual_tag), open_recordings(data.validation, data.virtual_tag)
+    training = open_recordings(data.recordings, data.virtual_tag, data.control)
+    return training, open_recordings(data.validation, data.virtual_tag)
 
 
 def _resolved(path: str) -> str:
