@@ -24,11 +24,17 @@ from .stored_frames import StoredFrames, create_array
 
 FORMAT = "tagjax-recording"
 VERSION = 1
+BY_ARRIVAL = "arrival"
+"""Attribute `reads_order` of a recording whose reads are stored as they arrived; they are sorted by time when it is opened."""
+
+UNFINISHED = "unfinished"
+"""Attribute of a recording that is still being written, or was cut off: nothing is written into it."""
+
 
 _TRUTH_ARRAYS = ("labels", "flow_px", "occluded", "backward_flow_px", "backward_occluded")
 _TRUTH_TABLES = ("tag_range_m", "tag_position_m", "visible", "line_of_sight", "carrier_box_px")
-_READ_SETTINGS = ("hop_table_hz", "phase_period_rad", "phase_sign", "pi_flips")
-_READ_COLUMNS = tuple(field.name for field in dataclasses.fields(TagReads) if field.name not in _READ_SETTINGS)
+READ_SETTINGS = ("hop_table_hz", "phase_period_rad", "phase_sign", "pi_flips")
+READ_COLUMNS = tuple(field.name for field in dataclasses.fields(TagReads) if field.name not in READ_SETTINGS)
 
 
 def save_recording(recording: Recording, path: str | Path, *, progress: bool = False) -> None:
@@ -75,7 +81,7 @@ def _parts(recording: Recording) -> tuple[dict[str, LazyArray], dict[str, np.nda
     frames: dict[str, LazyArray] = {"colour": recording.colour, "depth": recording.depth}
     arrays = {"time_ns": np.asarray(recording.time_ns), "antennas_m": np.asarray(recording.antennas_m, np.float64)}
     names, index = np.unique(np.asarray(reads.epc, dtype=str), return_inverse=True)
-    for name in _READ_COLUMNS:
+    for name in READ_COLUMNS:
         column = getattr(reads, name)
         if column is not None:
             arrays[f"reads/{name}"] = index.astype(np.int32) if name == "epc" else np.asarray(column)
@@ -85,7 +91,7 @@ def _parts(recording: Recording) -> tuple[dict[str, LazyArray], dict[str, np.nda
         "intrinsics": dataclasses.asdict(recording.intrinsics),
         "depth_kind": recording.depth_kind,
         "clock": None if recording.clock is None else dataclasses.asdict(recording.clock),
-        "reads": {name: getattr(reads, name) for name in _READ_SETTINGS},
+        "reads": {name: getattr(reads, name) for name in READ_SETTINGS},
         "epcs": [str(name) for name in names],
         "num_reads": reads.num_reads,
         "truth": None,
@@ -197,11 +203,13 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         # Recordings of the first releases list no arrays: there the stored arrays count.
         return name in listed if listed is not None else name in root
 
-    columns = {name: array(f"reads/{name}")[...] for name in _READ_COLUMNS if has(f"reads/{name}")}
+    columns = {name: array(f"reads/{name}")[...] for name in READ_COLUMNS if has(f"reads/{name}")}
     columns["epc"] = _epcs(attributes["epcs"], columns["epc"], path)
     stored = dict(attributes["reads"])
     stored["hop_table_hz"] = tuple(stored["hop_table_hz"])
     reads = TagReads(**columns, **stored)
+    if attributes.get("reads_order") == BY_ARRIVAL:
+        reads = reads[np.argsort(reads.time_ns, kind="stable")]
     if reads.num_reads != attributes["num_reads"]:
         raise RecordingError(f"{path}: {reads.num_reads} reads; expected {attributes['num_reads']}. Copy it again.")
     truth = None
@@ -234,7 +242,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         clock=None if attributes["clock"] is None else _clock(attributes["clock"], reads),
         name=attributes["name"],
         source=attributes["source"],
-        store=root if writable else None,
+        store=root if writable and not attributes.get(UNFINISHED) else None,
     )
 
 

@@ -12,6 +12,10 @@ from zarr.core.sync import sync
 from ..core.errors import RecordingError
 
 
+ZSTD_LEVEL = 3
+"""Of the compression of all arrays."""
+
+
 class StoredFrames:
     """A stored array, read when indexed. Raises `RecordingError` that names a frame which is missing or cannot be read."""
 
@@ -84,6 +88,6 @@ def create_array(root: zarr.Group, name: str, shape: tuple[int, ...], dtype: Any
         shape=shape,
         chunks=chunks,
         dtype=dtype,
-        compressors=[ZstdCodec(level=3, checksum=True)],
+        compressors=[ZstdCodec(level=ZSTD_LEVEL, checksum=True)],
         config={"write_empty_chunks": True},
     )

@@ -60,10 +60,14 @@ def reader_epoch(reader_ns: np.ndarray) -> str:
     return "2000" if first >= _YEAR_2000_NS else "1970"
 
 
-def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> HostTimes:
+def to_host_clock(
+    reader_ns: np.ndarray, arrival_ns: np.ndarray, *, short_drift_error_s: float = 0.0
+) -> HostTimes:
     """The reader's times on the host's clock, without the jitter of the times of arrival.
 
-    Both are int64 nanoseconds, one for each row. The smallest latency remains in the result. Raises `RecordingError` for
+    Both are int64 nanoseconds, one for each row. The smallest latency remains in the result. A piece shorter than
+    `MIN_DRIFT_SPAN_S` gets a drift only where its 95 % interval, over half of the piece, is within `short_drift_error_s`: so
+    it is with many reads, whose times of arrival the host itself took. Raises `RecordingError` for
     fewer than two rows, different numbers of them, a clock that stands still, runs backwards or drifts by more than
     `MAX_DRIFT_PPM`, and if more than `MAX_SET_ASIDE` of the rows fit no clock.
     """
@@ -80,7 +84,7 @@ def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> HostTimes:
     time_ns, usable = arrival.copy(), np.zeros(len(reader), bool)
     fits = []
     for rows in continuous_pieces(reader, arrival):
-        fit = _fit(reader[rows], arrival[rows])
+        fit = _fit(reader[rows], arrival[rows], short_drift_error_s)
         time_ns[rows], usable[rows] = fit.to_host(reader[rows]), fit.usable
         fits.append(fit)
     usable &= ~repeats
@@ -142,7 +146,7 @@ class _Fit:
         return reader + round(piece.offset_s * 1e9) + np.rint(drift_ns).astype(np.int64)
 
 
-def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
+def _fit(reader: np.ndarray, arrival: np.ndarray, short_drift_error_s: float) -> _Fit:
     """Offset and drift of one piece, and which of its rows fit them."""
     in_order = _in_order(reader, _SWAPPED_S) & _in_order(arrival, _LATE_S)
     if 2 * in_order.sum() < len(reader) and len(reader) > 2:
@@ -155,8 +159,10 @@ def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
         raise RecordingError(_no_clock(reader, arrival, "its times do not increase"))
     line = _envelope_line(since_s[in_order], delay_s[in_order])
     span_s = float(np.ptp(since_s[in_order]))
-    limit = MAX_DRIFT_PPM * 1e-6
-    if span_s < MIN_DRIFT_SPAN_S:  # there a drift is not fitted, and must not matter
+    limit, is_long = MAX_DRIFT_PPM * 1e-6, span_s >= MIN_DRIFT_SPAN_S
+    is_narrow = 0 < (line.high - line.low) * span_s / 4 <= short_drift_error_s
+    measured = line.num_points >= _MIN_POINTS and (is_long or is_narrow)
+    if not (is_long or measured):  # there a drift is not fitted, and must not matter
         limit = min(limit, 2 * MAX_UNCERTAINTY_S / max(span_s, 1e-9))
     if line.low > limit or line.high < -limit:
         raise RecordingError(_no_clock(reader[in_order], arrival[in_order], f"a drift of {1e6 * line.slope:.0f} ppm"))
@@ -165,7 +171,6 @@ def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
             f"The smallest delays of arrival spread by {1e3 * line.spread_s:.0f} ms about a line; expected at most "
             f"{2e3 * MAX_UNCERTAINTY_S:.0f} ms. One of the clocks does not run evenly: import with clock=arrival."
         )
-    measured = span_s >= MIN_DRIFT_SPAN_S and line.num_points >= _MIN_POINTS
     drift = line.slope if measured else 0.0
     low, offset_s, high = _smallest(delay_s[in_order] - drift * since_s[in_order])
     late_s = delay_s - drift * since_s - offset_s
