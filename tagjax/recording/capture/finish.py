@@ -44,14 +44,16 @@ def finish_recording(path: str | Path) -> Finished:
     counts = {name: one["shape"][0] for name, one in metadata.items() if "shape" in one}
     with writing(path):
         arrays = {name: zarr.open_array(str(path / name), mode="r+", zarr_format=3) for name in counts}
+        _cut_to_what_is_there(path, arrays, counts)
         frames, reads = _frame_times(arrays, counts), _read_times(arrays, counts)
         arrays["time_ns"][: len(frames.time_ns)] = frames.time_ns
         arrays["reads/time_ns"][: len(reads.time_ns)] = reads.time_ns
         for name, array in arrays.items():  # what was written after the last commit goes
             array.resize((counts[name], *array.shape[1:]))
             _remove_chunks(path / name / "c", array, counts[name])
+        attributes["num_reads"] = counts["reads/time_ns"]
         write_root(path, _final(attributes, frames, reads), None)
-    return Finished(path, counts["time_ns"], attributes["num_reads"], reads, frames)
+    return Finished(path, counts["time_ns"], counts["reads/time_ns"], reads, frames)
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -65,6 +67,24 @@ def _document(path: Path) -> dict[str, Any]:
     if not good:
         raise RecordingError(f"{path}: a Zarr group, but no recording. Check the path.")
     return document
+
+
+def _cut_to_what_is_there(path: Path, arrays: dict[str, zarr.Array], counts: dict[str, int]) -> None:
+    """Shorten the counts of frames and of reads to those whose chunks are all there: a power cut may have taken the last ones."""
+    frames = [name for name in counts if not name.startswith(("reads/", "antennas_m"))]
+    for group in (frames, [name for name in counts if name.startswith("reads/")]):
+        whole = min(_num_whole(path / name, arrays[name], counts[name]) for name in group)
+        counts |= dict.fromkeys(group, whole)
+
+
+def _num_whole(folder: Path, array: zarr.Array, count: int) -> int:
+    """How many of `count` rows or frames lie before the first chunk that is missing or empty."""
+    size, rest = array.chunks[0], (0,) * (array.ndim - 1)
+    for chunk in range(-(-count // size)):
+        file = folder / array.metadata.encode_chunk_key((chunk, *rest))
+        if not file.is_file() or file.stat().st_size == 0:
+            return chunk * size
+    return count
 
 
 def _remove_chunks(folder: Path, array: zarr.Array, count: int) -> None:

@@ -1,8 +1,9 @@
 """A recording that is written as it goes: memory does not grow, and at any moment the folder is a recording that opens.
 
-Frames are chunks of their own, reads chunks of 4,096 rows. They are written first and flushed to the disk. Then one file, the
-group's `zarr.json` with the consolidated metadata of all arrays (Zarr v3), is replaced at once: it alone says how many frames
-and reads there are. A process that is killed loses what came since the last such commit, and nothing else.
+Frames are chunks of their own, reads chunks of 4,096 rows. They are written first. Then one file, the group's `zarr.json` with
+the consolidated metadata of all arrays (Zarr v3), is replaced at once: it alone says how many frames and reads there are. A
+process that is killed loses what came since the last such commit, and nothing else. A thread of its own then asks the disk to
+keep the files, so that a slow disk holds up no sensor; what a power cut takes away before that, `finish_recording` cuts off.
 """
 
 from __future__ import annotations
@@ -45,7 +46,6 @@ _COLUMNS = {
     "channel_index": np.int16,
 }
 _ZSTD = Zstd(level=ZSTD_LEVEL, checksum=True)
-_NUM_FLUSHING = 8  # files that are flushed at the same time
 FRAME_TIMES = ("time_ns", "capture/frame_device_time_ns", "capture/frame_arrival_time_ns")
 
 
@@ -61,8 +61,9 @@ class VideoFormat:
 class RecordingWriter:
     """Writes a recording into a new folder. It is used by one thread at a time.
 
-    `commit` makes durable what was added; nothing else does. `finish_recording` completes the folder. Raises
-    `RecordingError` for a folder that exists or a name that cannot be one, and `WriteError` where the disk refuses.
+    `commit` lets the folder show what was added; nothing else does. `close` commits, and waits for the disk. Afterwards
+    `finish_recording` completes the folder. Raises `RecordingError` for a folder that exists or a name that cannot be one,
+    and `WriteError` where the disk refuses.
     """
 
     def __init__(self, path: str | Path, video: VideoFormat, antennas_m: np.ndarray, *, name: str, source: str = ""):
@@ -79,7 +80,8 @@ class RecordingWriter:
         self._frame_times: list[tuple[int, int, int]] = []
         self._reads: list[CapturedRead] = []
         self._last_time_ns = -1
-        self._written: list[Path] = []  # since the last commit
+        self._written: list[Path] = []  # and not yet flushed to the disk
+        self._disk, self._flushing = ThreadPoolExecutor(1, "flushing"), None
         shape = (video.intrinsics.height, video.intrinsics.width)
         make_folder(self.path)
         with writing(self.path):
@@ -134,7 +136,7 @@ class RecordingWriter:
             self._events.append(dataclasses.asdict(event))
 
     def commit(self) -> None:
-        """Make durable what was added, and let the folder show it."""
+        """Let the folder show what was added."""
         times, reads = self._frame_times, self._reads
         self._frame_times, self._reads = [], []
         with writing(self.path):
@@ -144,13 +146,27 @@ class RecordingWriter:
             if reads:
                 for name, values in self._table(reads).items():
                     self._append(f"reads/{name}", values)
-            with ThreadPoolExecutor(_NUM_FLUSHING) as pool:
-                list(pool.map(_flush, self._written))
-            self._written = []
             self._counts |= dict.fromkeys(self._frames, self.num_frames)
             for name, count in self._counts.items():
                 self._metadata[name]["shape"][0] = count
             write_root(self.path, self.attributes(), self._metadata)
+            if self._flushing is None or self._flushing.done():
+                self._flush()
+
+    def close(self) -> None:
+        """Commit what was added, and wait until the disk has it."""
+        self.commit()
+        with writing(self.path):
+            self._flush()
+            self._flush()
+        self._disk.shutdown()
+
+    def _flush(self) -> None:
+        """Wait for the disk to have kept what it was asked to, and ask it to keep what was written since."""
+        if self._flushing is not None:
+            self._flushing.result()
+        files, self._written = self._written, []
+        self._flushing = self._disk.submit(_flush_files, [*files, self.path / META, self.path])
 
     def attributes(self) -> dict[str, Any]:
         """The attributes of the group, as of now."""
@@ -161,7 +177,12 @@ class RecordingWriter:
             "intrinsics": dataclasses.asdict(self.video.intrinsics),
             "depth_kind": self.video.depth_kind,
             "clock": None,
-            "reads": {"hop_table_hz": list(hop_table_hz), "phase_period_rad": 2 * np.pi, "phase_sign": 1, "pi_flips": None},
+            "reads": {
+                "hop_table_hz": list(hop_table_hz),
+                "phase_period_rad": 2 * np.pi,
+                "phase_sign": 1,
+                "pi_flips": None,
+            },
             "epcs": list(self._epcs),
             "num_reads": self.num_reads,
             "truth": None,
@@ -221,8 +242,6 @@ def write_root(path: Path, attributes: dict[str, Any], metadata: dict[str, Any] 
     if metadata is not None:
         document["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": metadata}
     write_atomic(path / META, json.dumps(document))
-    _flush(path / META)
-    _flush(path)
 
 
 def _json(value: Any) -> Any:
@@ -230,11 +249,12 @@ def _json(value: Any) -> Any:
     return json.loads(json.dumps(value, default=lambda one: one.item() if isinstance(one, np.generic) else list(one)))
 
 
-def _flush(path: Path) -> None:
-    """Let the operating system write a file, or the names in a folder, to the disk."""
-    with contextlib.suppress(FileNotFoundError, PermissionError):
-        number = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
+def _flush_files(paths: Sequence[Path]) -> None:
+    """Let the operating system write files, or the names in a folder, to the disk."""
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError, PermissionError):
+            number = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(number)
+            finally:
+                os.close(number)

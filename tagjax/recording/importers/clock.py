@@ -60,9 +60,7 @@ def reader_epoch(reader_ns: np.ndarray) -> str:
     return "2000" if first >= _YEAR_2000_NS else "1970"
 
 
-def to_host_clock(
-    reader_ns: np.ndarray, arrival_ns: np.ndarray, *, short_drift_error_s: float = 0.0
-) -> HostTimes:
+def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray, *, short_drift_error_s: float = 0.0) -> HostTimes:
     """The reader's times on the host's clock, without the jitter of the times of arrival.
 
     Both are int64 nanoseconds, one for each row. The smallest latency remains in the result. A piece shorter than
