@@ -11,7 +11,6 @@ from zarr.core.sync import sync
 
 from ..core.errors import RecordingError
 
-
 ZSTD_LEVEL = 3
 """Of the compression of all arrays."""
 

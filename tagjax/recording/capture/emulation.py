@@ -163,7 +163,8 @@ class AbstractEmulator(abc.ABC):
     def clock_ns(self, row: int) -> int:
         """What the reader's clock shows at a row."""
         assert self.start.time_ns is not None
-        return int(self.table.reader_time_ns(self.table.since_ns[row], self.start.time_ns)) + self._boot_ns
+        (shown_ns,) = self.table.reader_time_ns(self.table.since_ns[row : row + 1], self.start.time_ns)
+        return int(shown_ns) + self._boot_ns
 
     async def reboot(self, off_s: float = 0.5, clock_jump_s: float = -1000.0) -> None:
         """Go away for a while; afterwards the clock is another, by `clock_jump_s`."""

@@ -90,9 +90,10 @@ class R700Reader(AbstractReader):
         connector = aiohttp.TCPConnector(ssl=True if self._ssl is None else self._ssl)
         timeout = aiohttp.ClientTimeout(total=None, connect=connection.timeout_s, sock_connect=connection.timeout_s)
         async with aiohttp.ClientSession(connector=connector, timeout=timeout, auth=self._auth()) as http:
-            answers = True
+            runs = False
             try:
                 info = await self._start(http)
+                runs = True
                 yield info
                 async with http.get(f"{self.address}{_API}/data/stream") as stream:
                     _refuse(stream, self.name)
@@ -101,11 +102,11 @@ class R700Reader(AbstractReader):
                         async for item in items:
                             yield item
             except (aiohttp.ClientError, OSError) as error:
-                answers = False
+                runs = False
                 text = str(error) or type(error).__name__
                 raise error if isinstance(error, ReaderLostError) else ReaderLostError(text) from error
             finally:
-                if answers:
+                if runs:
                     with contextlib.suppress(aiohttp.ClientError, OSError):
                         await self._call(http, "POST", "profiles/stop")
 

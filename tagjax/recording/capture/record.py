@@ -14,9 +14,10 @@ from typing import Any
 from ...core.errors import RecordingError
 from ...core.interruption import signals_handled
 from ..store import open_recording
+from .camera import CameraError
 from .finish import Finished, finish_recording
 from .progress import Progress
-from .reads import CapturedRead, ReaderEvent, ReaderInfo
+from .reads import CapturedRead, ReaderError, ReaderEvent, ReaderInfo
 from .settings import RecordConfig, Sensors, make_reader, make_sensors
 from .writer import RecordingWriter, VideoFormat
 from .writing_thread import FilmingThread, Threads, WritingThread
@@ -49,8 +50,10 @@ def record(
         shutil.rmtree(out, ignore_errors=True)
         raise error or RecordingError(f"{out}: neither a frame nor a read came; nothing is kept. {progress.last_event}")
     finished = finish_recording(out)
-    if error is not None:
+    if isinstance(error, CameraError | ReaderError):
         raise type(error)(f"{error} What was recorded until then is in {out}.") from error
+    if error is not None:
+        raise error
     return {**_summary(finished), **progress.summary(), "recorded_s": round(lasted, 2), "interrupted": interrupted}
 
 
@@ -115,7 +118,7 @@ async def _until_the_end(
     on_status: Callable[[str], None] | None,
 ) -> None:
     """Wait for a signal, the end of the time or of the frames, or an error, which is raised."""
-    begun = shown = time.monotonic()
+    begun, shown = None, time.monotonic()
     while not stop.is_set():
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_POLL_S):
@@ -128,7 +131,9 @@ async def _until_the_end(
             return
         if reading.done():
             reading.result()
-        if config.duration_s is not None and now - begun >= config.duration_s:
+        if begun is None and progress.num_frames:
+            begun = now
+        if config.duration_s is not None and begun is not None and now - begun >= config.duration_s:
             return
         if threads.filming.ended:
             await _last_reads(config, sensors)

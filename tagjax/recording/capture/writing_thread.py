@@ -78,7 +78,6 @@ class WritingThread:
                 for item in items:
                     if isinstance(item, VideoFormat):
                         self.writer = self._make(item)
-                        items = early
                         for one in early:
                             self._write(self.writer, one)
                     elif self.writer is None:
