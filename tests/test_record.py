@@ -184,7 +184,7 @@ def test_a_simulated_recording_is_traced_alike_after_it_went_through_sockets(
 
 
 def _k4a() -> Any:
-    class Timeout(Exception):
+    class NoFrameError(Exception):
         pass
 
     class Device:
@@ -206,7 +206,7 @@ def _k4a() -> Any:
         def get_capture(self, timeout: int) -> Any:
             self.count += 1
             if self.count == 2:
-                raise Timeout
+                raise NoFrameError
             colour = np.zeros((720, 1280, 4), np.uint8)
             colour[...] = (1, 2, 3, 255)  # BGRA
             depth = np.full((720, 1280), 1500 + self.count, np.uint16)
@@ -219,7 +219,7 @@ def _k4a() -> Any:
         PyK4A=Device,
         Config=names,
         K4AException=RuntimeError,
-        K4ATimeoutException=Timeout,
+        K4ATimeoutException=NoFrameError,
         CalibrationType=names(COLOR=1),
         ImageFormat=names(COLOR_BGRA32=3),
         DepthMode=names(NFOV_UNBINNED=2),

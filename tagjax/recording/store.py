@@ -20,7 +20,7 @@ from ..core.files import atomic_path
 from ..core.types import LazyArray
 from .reads import TagReads
 from .recording import ClockAudit, ClockPiece, Recording, Truth
-from .stored_frames import StoredFrames, create_array
+from .stored_frames import StoredFrames, create_array, num_chunks_present
 
 FORMAT = "tagjax-recording"
 VERSION = 1
@@ -186,7 +186,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
     def array(name: str) -> StoredFrames:
         try:
             found = root.get(name)
-            present = found.nchunks_initialized if isinstance(found, zarr.Array) and countable else None
+            present = num_chunks_present(found) if isinstance(found, zarr.Array) and countable else None
         except Exception as error:
             raise RecordingError(
                 f"{path}: array {name!r} cannot be opened ({type(error).__name__}: {error}). Copy the recording again."

@@ -10,6 +10,8 @@ User and password are taken from the environment variables TAGJAX_READER_USER an
 
 from __future__ import annotations
 
+import asyncio
+import base64
 import contextlib
 import dataclasses
 import json
@@ -89,7 +91,7 @@ class R700Reader(AbstractReader):
         aiohttp, connection = self._aiohttp, self.connection
         connector = aiohttp.TCPConnector(ssl=True if self._ssl is None else self._ssl)
         timeout = aiohttp.ClientTimeout(total=None, connect=connection.timeout_s, sock_connect=connection.timeout_s)
-        async with aiohttp.ClientSession(connector=connector, timeout=timeout, auth=self._auth()) as http:
+        async with aiohttp.ClientSession(connector=connector, timeout=timeout, headers=_headers()) as http:
             runs = False
             try:
                 info = await self._start(http)
@@ -109,10 +111,6 @@ class R700Reader(AbstractReader):
                 if runs:
                     with contextlib.suppress(aiohttp.ClientError, OSError):
                         await self._call(http, "POST", "profiles/stop")
-
-    def _auth(self) -> Any:
-        user, password = os.environ.get("TAGJAX_READER_USER"), os.environ.get("TAGJAX_READER_PASSWORD")
-        return None if user is None or password is None else self._aiohttp.BasicAuth(user, password)
 
     async def _call(self, http: aiohttp.ClientSession, method: str, path: str, body: Any = None) -> dict[str, Any]:
         """One request; its answer, {} where that is no JSON object. Raises `ReaderError` for one that the reader refuses."""
@@ -165,8 +163,6 @@ class R700Reader(AbstractReader):
 
 
 async def _within(awaitable: Any, seconds: float) -> Any:
-    import asyncio
-
     async with asyncio.timeout(seconds):
         return await awaitable
 
@@ -244,6 +240,14 @@ def inventory_body(wanted: InventorySettings) -> dict[str, Any]:
             for port in wanted.antennas
         ],
     }
+
+
+def _headers() -> dict[str, str]:
+    """Basic authentication by user and password of the environment; none where they are not there."""
+    user, password = os.environ.get("TAGJAX_READER_USER"), os.environ.get("TAGJAX_READER_PASSWORD")
+    if user is None or password is None:
+        return {}
+    return {"Authorization": f"Basic {base64.b64encode(f'{user}:{password}'.encode()).decode()}"}
 
 
 def _refuse(answer: Any, name: str, text: str = "") -> None:
