@@ -19,6 +19,7 @@ from tagjax.baselines.tagview.experiment import TagviewExperiment
 from tagjax.core.settings import from_mapping
 from tagjax.evaluation.flow import FlowEvaluationSettings
 from tagjax.evaluation.run import EvaluateConfig
+from tagjax.recording.capture.settings import RecordConfig
 from tagjax.sim.suites import SimulateConfig
 from tagjax.training.config import TrainConfig
 from tagjax.training.flow_config import TrainFlowConfig
@@ -28,6 +29,7 @@ SCHEMAS: dict[str, type] = {
     "evaluate": EvaluateConfig,
     "evaluate_flow": FlowEvaluationSettings,
     "goller": GollerExperiment,
+    "record": RecordConfig,
     "simulate": SimulateConfig,
     "tagview": TagviewExperiment,
     "train": TrainConfig,
