@@ -173,6 +173,7 @@ def test_a_killed_process_loses_a_second_at_most(tmp_path: Path) -> None:
         [sys.executable, "-c", _CHILD, str(path)], stdout=subprocess.PIPE, text=True, env=environment
     )
     assert child.stdout is not None
+    line = ""
     for line in child.stdout:
         if int(line.split()[1]) > 900:  # two seconds
             break
@@ -241,9 +242,9 @@ def test_a_slow_disk_costs_frames_that_are_counted_and_no_memory(tmp_path: Path)
     recording, progress = small_recording(10.0), Progress()
 
     class Slow(RecordingWriter):
-        def add_frame(self, *frame: Any) -> None:
+        def add_frame(self, *frame: Any, **more: Any) -> None:
             time.sleep(0.01)
-            super().add_frame(*frame)
+            super().add_frame(*frame, **more)
 
     def make(video: VideoFormat) -> RecordingWriter:
         return Slow(tmp_path / "a.zarr", video, recording.antennas_m, name="slow")
