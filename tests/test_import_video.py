@@ -51,6 +51,35 @@ def test_an_mp4_has_the_times_of_its_container_and_the_depth_of_its_folder(video
     assert recording.name == "take1"
 
 
+def _speed_up(path: Path, first: int) -> None:
+    """Give the frames of an .mp4 from number `first` on half the duration: a second entry in its table of durations."""
+    data = bytearray(path.read_bytes())
+    parents, place, end = [], 0, len(data)
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"):
+        while data[place + 4 : place + 8] != name:
+            place += int.from_bytes(data[place : place + 4], "big")
+            assert place < end
+        parents.append(place)
+        end, place = place + int.from_bytes(data[place : place + 4], "big"), place + 8
+    count, number, duration = (int.from_bytes(data[place + 4 * n : place + 4 * n + 4], "big") for n in (1, 2, 3))
+    assert (count, number) == (1, NUM_FRAMES)
+    table = (2, first, duration, NUM_FRAMES - first, duration // 2)
+    data[place + 4 : place + 16] = b"".join(value.to_bytes(4, "big") for value in table)
+    for box in parents:
+        data[box : box + 4] = (int.from_bytes(data[box : box + 4], "big") + 8).to_bytes(4, "big")
+    path.write_bytes(data)
+
+
+def test_frames_of_different_durations_keep_their_times(video, tmp_path):
+    _speed_up(video, 3)
+    times_s = np.array([0.0, 0.04, 0.08, 0.12, 0.14, 0.16, 0.18, 0.20])
+    for number, path in enumerate(sorted((video.parent / "depth").iterdir())):
+        path.rename(path.with_name(f"{times_s[number] + 0.001:.3f}.png"))
+    recording = imported(video, tmp_path / "a.zarr")
+    np.testing.assert_array_equal(recording.time_ns, np.rint(times_s * 1e9))
+    np.testing.assert_array_equal(recording.depth[7], depth_mm(7))
+
+
 def test_a_lossless_video_keeps_every_pixel(tmp_path):
     frames = [colour(number) for number in range(NUM_FRAMES)]
     path = _write_video(tmp_path / "in" / "take.avi", "MPNG", frames)

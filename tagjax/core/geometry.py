@@ -72,16 +72,16 @@ def register_depth(
 
 
 def _fill_pinholes(depth_m: np.ndarray) -> np.ndarray:
-    padded = np.pad(depth_m, 1)
-    height, width = depth_m.shape
-    near = np.stack([padded[dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)])
-    known = near > 0
-    hole = (depth_m == 0) & (known.sum(axis=0) >= 5)
-    if not hole.any():
+    known = np.pad((depth_m > 0).view(np.uint8), 1)
+    along = known[:-2] + known[1:-1] + known[2:]
+    count = along[:, :-2] + along[:, 1:-1] + along[:, 2:]
+    row, column = np.nonzero((depth_m == 0) & (count >= 5))
+    if not len(row):
         return depth_m
-    values = np.where(known, near, np.nan)[:, hole]
+    padded = np.pad(depth_m, 1)
+    near = np.stack([padded[row + dy, column + dx] for dy in range(3) for dx in range(3)])
     out = depth_m.copy()
-    out[hole] = np.nanmedian(values, axis=0)
+    out[row, column] = np.nanmedian(np.where(near > 0, near, np.nan), axis=0)
     return out
 
 
