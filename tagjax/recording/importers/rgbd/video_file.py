@@ -52,7 +52,7 @@ def open_video(path: Path, camera_file: Path | None = None, start: str | float |
 
     return RgbdSource(
         name=valid_name(path.stem),
-        description=f"video {path.name} of {num_frames} frames and depth pictures of {folder.name}",
+        description=f"video {path.name} of {num_frames} frames and depth pictures in {folder.name}/",
         rig=camera.rig(str(found)),
         pictures=pictures,
         max_gap_s=camera.max_gap_s,
