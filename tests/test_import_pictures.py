@@ -9,6 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from composed import CONF
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from rgbd_files import (
     CAMERA,
     HEIGHT,
@@ -24,6 +27,7 @@ from rgbd_files import (
 )
 
 from tagjax.core.geometry import register_depth, undistort
+from tagjax.core.settings import from_mapping
 from tagjax.recording import Intrinsics, RecordingError
 from tagjax.recording.importers.rgbd.camera_file import read_camera_file
 from tagjax.recording.importers.rgbd.picture_folder import open_picture_folder
@@ -309,6 +313,9 @@ def test_folders_without_what_is_needed_are_refused_with_what_is_supported(folde
         ) as caught:
             import_recording(ImportSettings(video=str(tmp_path / name)))
         assert "docs/importing.md" in str(caught.value)
+    (tmp_path / "empty" / "take.mcap").touch()
+    with pytest.raises(RecordingError, match=r"It holds take\.mcap: give the path of that file"):
+        import_recording(ImportSettings(video=str(tmp_path / "empty")))
     with pytest.raises(RecordingError, match="no such file or folder"):
         import_recording(ImportSettings(video=str(tmp_path / "gone")))
 
@@ -319,3 +326,15 @@ def test_without_out_nothing_is_written(folder):
     assert any("colour camera: 64 x 48" in line for line in lines)
     assert [path.name for path in folder.parent.iterdir()] == ["take 1"]
     assert json.loads((folder / "camera.json").read_text())["depth_registered"] is True
+
+
+def test_the_settings_of_the_command_are_those_of_the_library():
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        values = OmegaConf.to_container(compose("import_recording"), resolve=True)
+    assert isinstance(values, dict)
+    known = {field.name for field in dataclasses.fields(ImportSettings)}
+    assert set(values) - {"paths"} == known
+    assert (
+        from_mapping(ImportSettings, {str(key): value for key, value in values.items() if key in known})
+        == ImportSettings()
+    )

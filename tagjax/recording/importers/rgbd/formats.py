@@ -29,6 +29,9 @@ SUPPORTED = (
 """What can be imported, for messages."""
 
 
+_FILES = {".mkv": "azure_kinect", **dict.fromkeys(ENDINGS, "video"), **dict.fromkeys(BAG_ENDINGS, "bag")}
+
+
 @dataclasses.dataclass(frozen=True)
 class SourceOptions:
     """What the user states beside the path."""
@@ -42,14 +45,11 @@ def recognise(path: Path, camera: str | None = None) -> str:
     """The format of what a path holds. Raises `RecordingError`, which lists what is supported."""
     if not path.exists():
         raise RecordingError(f"video={path}: no such file or folder. Check the path.")
-    if path.is_dir():
-        found = _folder_format(path, camera)
-    else:
-        found = {".mkv": "azure_kinect", **dict.fromkeys(ENDINGS, "video"), **dict.fromkeys(BAG_ENDINGS, "bag")}.get(
-            path.suffix.lower()
-        )
+    found = _folder_format(path, camera) if path.is_dir() else _FILES.get(path.suffix.lower())
     if found is None:
-        raise RecordingError(f"video={path}: no known recording. {supported()}")
+        inside = sorted(one.name for one in path.iterdir() if one.suffix.lower() in _FILES) if path.is_dir() else []
+        hint = f" It holds {', '.join(inside[:3])}: give the path of that file." if inside else ""
+        raise RecordingError(f"video={path}: no known recording.{hint} {supported()}")
     return found
 
 

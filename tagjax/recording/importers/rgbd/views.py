@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ class Views:
         self.rig = rig
         self.intrinsics = dataclasses.replace(rig.colour, distortion=())
         # Depth that is registered here is converted to z first.
-        self.depth_kind = "depth" if rig.depth is not None else rig.depth_kind
+        self.depth_kind: Literal["depth", "range"] = "depth" if rig.depth is not None else rig.depth_kind
         self._colour_maps = _lens_maps(rig.colour)
         self._depth_maps = self._colour_maps if rig.depth is None else _lens_maps(rig.depth)
 
