@@ -203,9 +203,8 @@ def test_every_page_fits_and_reports_no_error(site: Path, browser: Any, width: i
 @pytest.mark.ci
 def test_search_works_in_a_page_opened_as_a_file(site: Path, browser: Any) -> None:
     page, problems = _open(browser, (site / "reference" / "core.html").as_uri(), 1400)
-    page.locator("input[name=query]").fill("antennas_m")
-    first = page.locator(".md-search-result__link").first
-    first.wait_for()
+    page.locator("input[name=query]").press_sequentially("antennas_m")  # the page listens to keys
+    page.locator(".md-search-result__link").first.wait_for(timeout=60_000)
     assert "own-recordings" in [
         Path(str(one.get_attribute("href")).split("?")[0]).stem for one in page.locator(".md-search-result__link").all()
     ]
