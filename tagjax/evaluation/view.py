@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from ..core.progress import OnProgress, unobserved
 from ..core.settings import changed
 from ..recording.loading import VirtualTagSettings, open_recordings
 from ..report.viewer import log_recording, rerun
@@ -35,12 +36,10 @@ class ViewConfig:
         changed(ClipSettings(), self.clips, where="clips")
 
 
-def view_recording(
-    config: ViewConfig, folder: Path, *, on_frame: Callable[[int, int], None] = lambda done, total: None
-) -> Path | None:
+def view_recording(config: ViewConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> Path | None:
     """Trace the recording and log every frame; the path of the file `folder`/<recording>.rrd, or None if it is shown live.
 
-    `on_frame` is called with the number of frames that are done and that of all.
+    `on_progress` counts the frames.
     """
     rerun()  # before any work
     if config.weights is not None:
@@ -56,11 +55,12 @@ def view_recording(
     def traced() -> Iterator[tuple[int, Trace]]:
         settings = TraceSettings(smooth=config.smooth)
         load = clip_loader(clips)
+        on_progress("trace", 0, last - first, "compiling")
         for number, trace in trace_recording(
             tracer, recording, load, epcs=epcs, settings=settings, frames=(first, last)
         ):
             yield number, trace
-            on_frame(number + 1 - first, last - first)
+            on_progress("trace", number + 1 - first, last - first)
 
     out = None if config.live else folder / f"{recording.name}.rrd"
     log_recording(recording, traced(), epcs, antennas, stride=clips.stride, depth=config.depth or config.live, out=out)
