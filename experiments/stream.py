@@ -19,12 +19,13 @@ from .command import checked, command, print_result
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.evaluation.stream import StreamConfig, run_stream
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = checked(StreamConfig, values, folder)
-    with console.status("compiling") as status:
-        summary = run_stream(config, folder, on_frame=status.update if progress else None)
+    with progress_lines(shown=progress, console=console) as report:
+        summary = run_stream(config, folder, on_progress=report)
     console.print(
         f"{summary['frames']} frames at {summary['frames_per_s']:.1f}/s, {summary['dropped_frames']} dropped; a frame took "
         f"{summary['process_ms']['p50']:.1f} ms (median), {summary['process_ms']['p99']:.1f} ms (99 %); its result came "

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.camera import working_stride
 from ..core.machine import peak_memory_mib
+from ..core.progress import OnProgress, unobserved
 from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..flow.registry import make_flow
@@ -67,7 +68,7 @@ class Milliseconds:
         return {name: round(value, 2) for name, value in {**named, "max": self.highest}.items()}
 
 
-def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], None] | None = None) -> dict[str, Any]:
+def run_stream(config: StreamConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> dict[str, Any]:
     """Trace the recording live; the summary, which is also written to stream.json.
 
     Writes a line a frame to frames.jsonl as it goes. Ctrl-C ends the stream, and the summary covers what was traced. Raises
@@ -91,6 +92,8 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
         depth_kind=recording.depth_kind,
         num_places=config.num_places,
     )
+    total = recording.num_frames * config.replay.loops
+    on_progress("stream", 0, total, "compiling")
     start_s = live.warm_up()
     computing, latency, num_frames, num_dropped_reads, num_unused_reads = Milliseconds(), Milliseconds(), 0, 0, 0
     statuses = {one.word: 0 for one in Status if one is not Status.UNKNOWN}
@@ -112,9 +115,10 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
                 lines.write(json.dumps(line) + "\n")
                 for tag in line["tags"].values():
                     statuses[tag["status"]] += 1
-                if on_frame is not None:
-                    tags = ", ".join(f"{epc} {tag['status']}" for epc, tag in line["tags"].items()) or "no tag"
-                    on_frame(f"frame {num_frames}: {computing.percentile(50):.0f} ms; {tags}")
+                tags = ", ".join(f"{epc} {tag['status']}" for epc, tag in line["tags"].items()) or "no tag"
+                on_progress(
+                    "stream", num_frames + replay.num_dropped, total, f"{computing.percentile(50):.0f} ms; {tags}"
+                )
         except KeyboardInterrupt:
             interrupted = True
         summary = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ....core.files import write_atomic
 from ....core.numerics import SPEED_OF_LIGHT_M_S
+from ....core.progress import OnProgress, unobserved
 from ....core.results import write_csv, write_json
 from ....recording import Recording
 from ....recording.store import open_recording
@@ -90,13 +91,10 @@ def _count(variant: str) -> int:
     return _COUNTS.index(variant) if variant in _COUNTS else -1
 
 
-def run_tagview(
-    config: TagviewExperiment, folder: Path, *, on_progress: Callable[[str, int, int], None] | None = None
-) -> dict[str, Any]:
+def run_tagview(config: TagviewExperiment, folder: Path, *, on_progress: OnProgress = unobserved) -> dict[str, Any]:
     """Track and identify all recordings; writes `metrics.json`, `report.md`, `recordings.csv` and plots.
 
-    Returns the metrics. `on_progress` gets the recording's name, its number and the number of recordings. Raises
-    `ValueError` for suites without recordings and for recordings to which Tagview does not apply.
+    Returns the metrics. `on_progress` counts the recordings. Raises `ValueError` for suites without recordings and for recordings to which Tagview does not apply.
     """
     from .. import figures
 
@@ -107,8 +105,7 @@ def run_tagview(
     mm_per_px, num_rows = [], 0
     for number, (group, path) in enumerate(todo):
         recording = open_recording(path)
-        if on_progress is not None:
-            on_progress(recording.name, number, len(todo))
+        on_progress("track", number, len(todo), recording.name)
         reason = tracer.inapplicable(recording)
         if reason is not None:
             raise ValueError(f"{recording.name}: Tagview does not apply: {reason}")
@@ -120,6 +117,7 @@ def run_tagview(
         if number == 0:
             picture = np.asarray(recording.colour[0])
             figures.track_plot(folder / "tracks.png", tracked.name, tracked.truth_px, tracked.box_px, picture)
+    on_progress("track", len(todo), len(todo))
     metrics = _metrics(config, scores, float(np.mean(mm_per_px)), num_rows)
     main = [one for group in scores.values() for one in group[config.main]]
     pairs = [one for one in main if not one.recording.startswith(_SAME_PHASE)]
