@@ -24,6 +24,7 @@ def _command(name: str) -> Callable[[], None]:
 
 benchmark = _command("benchmark")
 calibrate_camera = _command("calibrate_camera")
+check = _command("check")
 compare = _command("compare")
 error_budget = _command("error_budget")
 evaluate = _command("evaluate")
