@@ -23,6 +23,7 @@ def _command(name: str) -> Callable[[], None]:
 
 
 benchmark = _command("benchmark")
+calibrate_antenna = _command("calibrate_antenna")
 calibrate_camera = _command("calibrate_camera")
 check = _command("check")
 compare = _command("compare")
