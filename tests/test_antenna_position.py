@@ -14,7 +14,6 @@ from limits_scenes import faultless
 from tagjax.core.settings import ConfigError
 from tagjax.evaluation import antenna_position
 from tagjax.evaluation.antenna_position import AntennaConfig, calibrate_antenna, find_antenna, path_reads
-from tagjax.radio.antenna_position import fit_position
 from tagjax.radio.reader import ReaderSettings
 from tagjax.recording import Recording, RecordingError, TagReads, Truth
 from tagjax.recording.store import save_recording
@@ -97,7 +96,7 @@ def test_offsets_of_channels_have_a_slope() -> None:
     own = dataclasses.replace(own, phase_rad=phase % (2 * np.pi))
     one = path_reads(own, time_s, path(time_s), offsets="channel", spread_rad=0.05)
     one = dataclasses.replace(one, group=jnp.zeros_like(one.group), num_groups=1)
-    fit = fit_position(one, jnp.asarray(ANTENNA_M + 0.01, jnp.float32), jnp.asarray(3.2e-7))
+    fit = antenna_position._fit(one, jnp.asarray(ANTENNA_M + 0.01, jnp.float32), jnp.asarray(3.2e-7))
     np.testing.assert_allclose(fit.position_m, ANTENNA_M, atol=0.002)
     assert float(fit.slope_rad_hz) == pytest.approx(slope, rel=0.02)
 

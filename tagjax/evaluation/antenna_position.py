@@ -232,8 +232,8 @@ def traced_path_m(recording: Recording, config: AntennaConfig, on_frame: Callabl
     for number, trace in trace_recording(
         make_tracer(config.tracer), recording, load, epcs=[config.epc], settings=settings
     ):
-        if trace.detected[0]:
-            path_m[number] = trace.centre_m[0]
+        if np.asarray(trace.detected)[0]:
+            path_m[number] = np.asarray(trace.centre_m)[0]
         on_frame(number + 1, recording.num_frames)
     return _smoothed(recording.frame_time_s(), path_m)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import zarr
+from rich import get_console
 from rich.markup import escape
 from rich.progress import track
 from zarr.storage import LocalStore
@@ -189,9 +190,8 @@ def _compute(recording: Recording, path: Path, key: str, flow: FlowFunction) -> 
     group = zarr.open_group(str(path), mode="w", zarr_format=3)
     targets = [create_array(group, direction, shape, np.float16, per_frame=True) for direction in _DIRECTIONS]
     pairs = _pairs(recording, 0, shape[0], flow)
-    for t, pair in enumerate(
-        track(pairs, description=escape(f"{recording.name}: {key} flow"), total=shape[0], transient=True)
-    ):
+    description, silent = escape(f"{recording.name}: {key} flow"), not get_console().is_terminal
+    for t, pair in enumerate(track(pairs, description, total=shape[0], transient=True, disable=silent)):
         for target, flow_px in zip(targets, pair, strict=True):
             target[t] = flow_px.astype(np.float16)
     group.attrs.update(_attributes(recording, key))

@@ -44,8 +44,8 @@ def judged(value: float, limits: tuple[float, float]) -> Verdict:
 
 def worst_verdict(verdicts: list[Verdict]) -> Verdict:
     """The worst of several verdicts; what was not measured counts only where nothing was."""
-    known = [one for one in verdicts if one != "not measured"]
-    return max(known, key=VERDICTS.index) if known else "not measured"
+    found: tuple[Verdict, ...] = ("bad", "limits", "good")
+    return next((one for one in found if one in verdicts), "not measured")
 
 
 def worst(values: np.ndarray, limits: tuple[float, float]) -> int:
