@@ -23,7 +23,9 @@ def _command(name: str) -> Callable[[], None]:
 
 
 benchmark = _command("benchmark")
+calibrate_antenna = _command("calibrate_antenna")
 calibrate_camera = _command("calibrate_camera")
+check = _command("check")
 compare = _command("compare")
 error_budget = _command("error_budget")
 evaluate = _command("evaluate")
