@@ -134,7 +134,7 @@ class Sources:
         return self.traced(system, item, pictures=False).frames
 
     def traced(self, system: System, item: Item, *, pictures: bool = True, whole: bool = False) -> Traced:
-        """The scores of a recording, and with `pictures` the masks of every frame. Traced unless `folder` has them.
+        """The scores of a recording, and with `pictures` the output at every frame. Traced unless `folder` has it all.
 
         The trace ends `NUM_FRAMES` after the last tag's first motion, or with `whole` at the recording's end.
         """
@@ -153,7 +153,7 @@ class Sources:
             stride=clips.stride,
             settings=dataclasses.replace(self.config.scores.supported_by(tracer), num_pictures=1),
             frames=(0, last),
-            on_picture=kept.append if pictures else None,
+            on_picture=kept.append,
         )
         traced = Traced(result.frames, kept)
         write_traced(path, traced)

@@ -231,10 +231,10 @@ def distribution(sources: Sources, items: list[Item], path: Path) -> str:
     columns = (at, *(maps.below(part, at) for part in (values, values[on_object], values[~on_object])))
     rows = ([f"{float(v):.6g}" for v in row] for row in zip(*columns, strict=True))
     write_csv(path.with_suffix(".csv"), ("level", "all", "object", "elsewhere"), rows)
-    above = float(np.mean(values >= scene.cut))
+    kept = [100 * float(np.mean(values[on_object] >= level)) for level in (scene.cut, corners[-1])]
     return (
-        f"{scene.where(frame)}. Corners at p = {corners[0]:.2f} and {corners[1]:.2f}; {100 * above:.2f} % of the pixels are above "
-        f"the cut, {100 * float(np.mean(on_object)):.2f} % are the object's."
+        f"{scene.where(frame)}. {kept[0]:.0f} % of the object's pixels are above the cut; {kept[1]:.0f} % would be above the last "
+        f"corner, p = {corners[-1]:.2f}."
     )
 
 
@@ -296,9 +296,9 @@ def _anchors(stages: Stages, true_mask: np.ndarray, crop: tuple[int, int, int, i
     away = ~cv2.dilate(true_mask.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
     moving = cv2.blur(np.abs(last), (5, 5)) > 0.012
     chosen: list[tuple[int, int]] = []
-    for part, count in ((core if (core & known).any() else true_mask, 2), (away & moving, 2), (away, 2)):
+    for part, total in ((core if (core & known).any() else true_mask, 2), (away & moving, 4), (away, 6)):
         places = np.argwhere(part & known)
-        for _ in range(min(count, len(places))):
+        for _ in range(min(total - len(chosen), len(places))):
             chosen.append(_farthest(places, chosen))
     return [
         maps.Anchor((column, row), bool(true_mask[row, column]), np.asarray(stages.motion_m[row, column], np.float64))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -44,15 +46,15 @@ def write_traced(path: Path, traced: Traced) -> None:
 def read_traced(path: Path, *, pictures: bool) -> Traced | None:
     """What `write_traced` wrote; None where there is no such file, it is damaged, or has no pictures although wanted."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             names = set(file.files)
             if pictures and "picture.frame" not in names:
                 return None
             arrays = {name: file[name] for name in names if pictures or not name.startswith("picture.")}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError):
+        frames = {str(epc): _scores(arrays, number) for number, epc in enumerate(arrays["epcs"])}
+        return Traced(frames, _pictures(arrays) if pictures else [])
+    except (OSError, ValueError, TypeError, zipfile.BadZipFile, zlib.error, EOFError, KeyError):
         return None
-    frames = {str(epc): _scores(arrays, number) for number, epc in enumerate(arrays["epcs"])}
-    return Traced(frames, _pictures(arrays) if pictures else [])
 
 
 def _scores(arrays: dict[str, np.ndarray], number: int) -> FrameScores:

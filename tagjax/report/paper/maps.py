@@ -125,27 +125,28 @@ def below(values: Float[np.ndarray, " pixels"], at: Float[np.ndarray, " levels"]
     return np.searchsorted(np.sort(values), at, side="right") / max(len(values), 1) if len(values) else np.ones(len(at))
 
 
-def cdf_corners(probability: Float[np.ndarray, " pixels"]) -> tuple[float, float]:
-    """The first and the last corner of the CDF between 0 and 1: farthest above the chord, then farthest below the next.
+def cdf_corners(probability: Float[np.ndarray, " pixels"], *, most: int = 5) -> list[float]:
+    """The corners of the CDF between 0 and 1, in order: where its slope changes most, at least 0.08 apart.
 
-    The first ends the steep rise of the background near 0, the last begins the rise of the object's pixels towards 1.
-    Both are levels of p; with no pixel in between both are where the chord is left.
+    Slopes are those over 0.04 to both sides, in parts of the rise from p = 0.01 to 1; changes below a tenth of the largest
+    do not count. A CDF that does not rise has its only corner at 0.
     """
     at = np.linspace(0.0, 1.0, 1001)
-    level = below(probability, at)
-    first = _farthest(at, level, 0)
-    last = _farthest(at, -level, first)
-    return float(at[first]), float(at[last])
-
-
-def _farthest(at: np.ndarray, level: np.ndarray, begin: int) -> int:
-    """Index of the point farthest above the chord from `begin` to the end; `begin` where none is above."""
-    rest = at[begin:]
-    if len(rest) < 3:
-        return begin
-    chord = level[begin] + (level[-1] - level[begin]) * (rest - rest[0]) / (rest[-1] - rest[0])
-    above = level[begin:] - chord
-    return begin + int(np.argmax(above)) if above.max() > 1e-9 else begin
+    level = below(probability, np.maximum(at, 0.01))
+    rise = level[-1] - level[0]
+    if rise <= 0:
+        return [0.0]
+    near = np.clip(np.arange(len(at))[:, None] + np.array([-40, 0, 40])[None], 0, len(at) - 1)
+    before, here, after = (level[near] / rise).T
+    change = np.abs((after - here) - (here - before))
+    change[[*range(10), *range(-10, 0)]] = 0.0
+    found: list[int] = []
+    for place in np.argsort(-change, kind="stable"):
+        if len(found) == most or change[place] < 0.1 * change.max():
+            break
+        if all(abs(place - other) >= 80 for other in found):
+            found.append(int(place))
+    return sorted(float(at[place]) for place in found) or [0.0]
 
 
 def refinement_figure(

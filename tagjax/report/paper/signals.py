@@ -28,10 +28,11 @@ def phase_figure(
     upper.plot(read_s, unwrapped_rad, "-", color=OURS, linewidth=1.3, label="unwrapped")
     tidy(upper, title="(A) phase", ylabel="phase (rad)")
     upper.legend(fontsize=FONT - 0.5, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    lower.plot(frame_s, 100 * truth_m, color=TRUTH, linewidth=2.6, alpha=0.25, label="true")
+    lower.plot(frame_s, 100 * truth_m, color=TRUTH, linewidth=3.2, alpha=0.25, label="true")
     for number, (name, distance_m) in enumerate(distances_m.items()):
-        lower.plot(read_s, 100 * distance_m, linestyle=DASHES[number], color=LINES[number], linewidth=1.2, label=name)
-    tidy(lower, title="(B) change of distance", xlabel="time (s)", ylabel="change of distance (cm)")
+        wide = {"linewidth": 2.6, "alpha": 0.5} if number == 0 else {"linewidth": 1.3}
+        lower.plot(read_s, 100 * distance_m, linestyle=DASHES[number], color=LINES[number], label=name, **wide)
+    tidy(lower, title="(B) distance", xlabel="time (s)", ylabel="change of distance (cm)")
     lower.legend(fontsize=FONT - 0.5, ncols=4, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
     save_small(figure, path)
 
@@ -59,7 +60,7 @@ def synchronisation_figure(
     upper.set_ylim(len(rows) - 0.5, -0.5)
     for at in frame_s:
         lower.axvline(at, color=OTHER, linewidth=0.5, alpha=0.5)
-    lower.plot(frame_s, 100 * truth_m, color=TRUTH, linewidth=2.6, alpha=0.25, label="true")
+    lower.plot(frame_s, 100 * truth_m, color=TRUTH, linewidth=3.2, alpha=0.25, label="true")
     lower.plot(read_s[shown], 100 * at_reads_m, "+", color=OURS, markersize=6, label=f"at the reads of {shown}")
     lower.plot(
         frame_s, 100 * at_frames_m, "o", color=PAPERS, markersize=4.5, markerfacecolor="none", label="at the frames"

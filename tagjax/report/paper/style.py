@@ -46,25 +46,38 @@ def tidy(axes: Axes, *, title: str = "", xlabel: str = "", ylabel: str = "") -> 
 
 
 def save_small(figure: Figure, path: Path, *, max_bytes: int = MAX_BYTES) -> None:
-    """Write a PNG of at most `max_bytes`: with ever fewer colours, then pixels, until it is small enough."""
-    from PIL import Image
-
+    """Write a PNG of at most `max_bytes`: as it is, or with ever fewer colours and then pixels, until it is small enough."""
     if path.suffix != ".png":
         raise ValueError(f"{path}: found the suffix {path.suffix!r}; expected .png.")
-    content = b""
     for dpi in (150, 120, 100, 80):
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=dpi, format="png")
-        for colours in (256, 128, 64, 32):
-            drawn.seek(0)
-            small = Image.open(drawn).convert("RGB").quantize(colours, dither=Image.Dither.NONE)
-            out = io.BytesIO()
-            small.save(out, format="png", optimize=True)
-            content = out.getvalue()
-            if len(content) <= max_bytes:
-                write_atomic(path, content)
-                return
+        content = _fewer_colours(drawn.getvalue(), max_bytes)
+        if len(content) <= max_bytes:
+            break
     write_atomic(path, content)
+
+
+def shrink(path: Path, *, max_bytes: int = MAX_BYTES) -> None:
+    """Write a PNG again with so few colours that it has at most `max_bytes`, as far as 64 colours suffice."""
+    write_atomic(path, _fewer_colours(path.read_bytes(), max_bytes))
+
+
+def _fewer_colours(content: bytes, max_bytes: int) -> bytes:
+    """A PNG with as many of its colours as fit; with 64 if none does."""
+    from PIL import Image
+
+    out = b""
+    for colours in (None, 256, 128, 64):
+        small = Image.open(io.BytesIO(content)).convert("RGB")
+        if colours is not None:
+            small = small.quantize(colours, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        written = io.BytesIO()
+        small.save(written, format="png", optimize=True)
+        out = written.getvalue()
+        if len(out) <= max_bytes:
+            break
+    return out
 
 
 def show(
