@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from composed import composed
 
 from experiments.suites import suites_named
 from tagjax.baselines.tagvision.experiment.simulated_calibration import PAPER_CAMERA, overhead
+from tagjax.core.results import write_json
 from tagjax.core.settings import ConfigError, from_mapping
-from tagjax.evaluation.paper import PaperConfig, run_paper, suites
+from tagjax.evaluation.paper import Drawn, PaperConfig, run_paper, suites
+from tagjax.evaluation.paper.run import drawn_before
 from tagjax.evaluation.paper.sources import MissingRecordingsError, Sources, described, last_frame
 from tagjax.evaluation.paper.table import FIGURES, chosen
 from tagjax.evaluation.paper.traced import Traced, read_traced, write_traced
@@ -184,8 +187,10 @@ def test_the_late_mean_weighs_each_tag_alike():
 
 def test_a_curve_ends_where_half_of_its_tags_are_left():
     one = curve([0.1] * 120, [4] * 60 + [2] * 20 + [1] * 40)
-    assert drawn_curves.shown(one).tolist() == list(range(80))
-    assert drawn_curves.shown(curve([0.1] * 120, [1] * 120)).tolist() == list(range(91))
+    assert np.flatnonzero(drawn_curves.shown(one)).tolist() == list(range(80))
+    gap = curve([0.1] * 120, [1] * 50 + [0] * 5 + [1] * 65)
+    assert np.flatnonzero(~drawn_curves.shown(gap)).tolist() == list(range(50, 55))
+    assert len(drawn_curves.shown(gap)) == 91
     assert not len(drawn_curves.shown(curve([], [])))
 
 
@@ -270,8 +275,22 @@ def test_all_without_recordings_leaves_figures_out_with_the_reason(tmp_path: Pat
     assert len(rows) == 300
     apart = [float(row["measured_rad"]) - float(row["theory_rad"]) for row in rows]
     assert np.angle(np.mean(np.exp(1j * np.array(apart)))) % (2 * np.pi) == pytest.approx(3.2, abs=0.03)
-    with pytest.raises(MissingRecordingsError):
+    with pytest.raises(MissingRecordingsError, match="Set simulate=true"):
         run_paper(config(tmp_path / "none", figure=2, simulate=False), tmp_path / "run")
+
+
+def test_the_page_keeps_the_figures_of_runs_before(tmp_path: Path):
+    old = Drawn("2", "TagAttention, Fig. 2", "two.png", "two.csv", "`a`, 1 recording (train)", "seen.")
+    gone = dataclasses.replace(old, name="3", picture="three.png")
+    (tmp_path / "two.png").touch()
+    write_json(tmp_path / "figures.json", [dataclasses.asdict(one) for one in (old, gone)])
+    run_paper(config(tmp_path, figure="tagvision_5"), tmp_path)
+    listed = json.loads((tmp_path / "figures.json").read_text())
+    assert [one["name"] for one in listed] == ["2", "tagvision_5"]
+    assert "![TagAttention, Fig. 2](two.png)" in (tmp_path / "figures.md").read_text()
+    for damaged in ("{", "[1]", '{"a": 1}', '[{"name": "2"}]'):
+        (tmp_path / "figures.json").write_text(damaged)
+        assert drawn_before(tmp_path) == []
 
 
 @pytest.mark.ci

@@ -14,7 +14,6 @@ from ...metrics.locking import first_motion
 from ...radio.published import published_distance, unwrap_slots
 from ...radio.unwrap import unwrap_paper
 from ...recording import Recording
-from ...report.overlay import short_name
 from ...report.paper import signals
 from ...sim.radio.planar import PlanarSettings
 from ...sim.suites import Item
@@ -62,7 +61,7 @@ def synchronisation(sources: Sources, items: list[Item], path: Path) -> str:
     """Fig. 3: the times of frames and reads, and a tag's distance at the reads and at the frames."""
     recording = sources.recording(items[0])
     names = {epc: f"tag {number}" for number, epc in enumerate(recording.reads.epcs, 1)}
-    epc = recording.reads.epcs[0]
+    epc = max(names, key=lambda one: recording.reads.select(one).num_reads)
     begin_s = _motion_s(recording, epc) + 0.5
     frame_s = recording.frame_time_s()
     shown = (frame_s >= begin_s) & (frame_s <= begin_s + _ZOOM_S)
@@ -93,8 +92,8 @@ def synchronisation(sources: Sources, items: list[Item], path: Path) -> str:
     error_mm = 1e3 * float(np.sqrt(np.nanmean((at_frames - offset - truth_m)[shown] ** 2)))
     counts = ", ".join(f"{name} {len(stamps)}" for name, stamps in read_s.items())
     return (
-        f"{int(shown.sum())} frames and these numbers of reads: {counts}. At the frames the root mean square error of {names[epc]} "
-        f"(..{short_name(epc)[-6:]}) is {error_mm:.1f} mm."
+        f"{int(shown.sum())} frames and these numbers of reads: {counts}. At the frames the root mean square error of "
+        f"{names[epc]} is {error_mm:.1f} mm."
     )
 
 

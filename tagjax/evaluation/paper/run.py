@@ -7,13 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...core.files import write_atomic
+from ...core.json_text import parse_json
 from ...core.results import write_json
+from ...core.settings import from_mapping
 from ...sim.suites import Item
 from .settings import PaperConfig
 from .sources import MissingRecordingsError, Sources, described
 from .table import FIGURES, PaperFigure, chosen
 
-PAGE = "figures.md"
+PAGE, LIST = "figures.md", "figures.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,9 +33,9 @@ class Drawn:
 def run_paper(
     config: PaperConfig, folder: Path, *, on_progress: Callable[[int, int, str], None] | None = None
 ) -> list[Drawn]:
-    """Draw the chosen figures into `folder`, each a PNG with a CSV of its numbers; `figures.md` shows all, `figures.json` lists them.
+    """Draw the chosen figures into `folder`, each a PNG with a CSV of its numbers, and return them.
 
-    `on_progress` gets the number of figures that are done, of all, and what is being done. With `all` and without
+    `figures.md` shows all figures that the folder holds, also those of runs before; `figures.json` lists them. `on_progress` gets the number of figures that are done, of all, and what is being done. With `all` and without
     simulation a figure whose recordings are missing is left out with the reason. Raises `ConfigError` where a figure that
     is named has no recording.
     """
@@ -54,9 +56,21 @@ def run_paper(
             if "all" not in config.figures():
                 raise
             drawn.append(Drawn(name, FIGURES[name].title, None, None, "", f"not drawn: {error}"))
-    write_json(folder / "figures.json", [dataclasses.asdict(one) for one in drawn])
-    write_atomic(folder / PAGE, page(drawn))
+        known = {one.name: one for one in (*drawn_before(folder), *drawn)}
+        listed = [known[name] for name in FIGURES if name in known]
+        write_json(folder / LIST, [dataclasses.asdict(one) for one in listed])
+        write_atomic(folder / PAGE, page(listed))
     return drawn
+
+
+def drawn_before(folder: Path) -> list[Drawn]:
+    """The figures that a folder lists and holds; none where its list is missing or damaged."""
+    try:
+        rows = parse_json((folder / LIST).read_bytes())
+        found = [from_mapping(Drawn, row) for row in rows]
+    except (OSError, ValueError, TypeError):
+        return []
+    return [one for one in found if one.name in FIGURES and one.picture and (folder / Path(one.picture).name).exists()]
 
 
 def draw(sources: Sources, name: str, folder: Path) -> Drawn:

@@ -95,8 +95,8 @@ class Sources:
             own = [item for item in found if item.variant.name == variant]
             if not own:
                 raise MissingRecordingsError(
-                    f"{name}, variant {variant}: found no recording of {', '.join(splits)} in {folder}. Name the figure, or set "
-                    "simulate=true, to simulate it."
+                    f"{name}, variant {variant}: found no recording of {', '.join(splits)} in {folder}; expected at least one. "
+                    "Set simulate=true to simulate it, or splits= to others."
                 )
             by_split = [[item for item in own if item.split == split][:limit] for split in splits]
             own = [item for items in by_split for item in items]

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from ...metrics.curves import Curve
 from .style import DASHES, FONT, LINES, save_small, sheet, tidy
@@ -26,35 +27,39 @@ class Panel:
     lines: Mapping[str, Mapping[str, Curve]]
 
 
-def shown(curve: Curve) -> np.ndarray:
-    """The frames of a curve that are drawn: up to `NUM_FRAMES`, while half of the tags are left that it had at its fullest."""
+def shown(curve: Curve) -> Bool[np.ndarray, " frame"]:
+    """Which frames up to `NUM_FRAMES` are drawn: those with half of the tags, or more, that the curve has at its fullest."""
     count = curve.num_tags[: NUM_FRAMES + 1]
-    enough = 2 * count >= count.max(initial=0)
-    return np.flatnonzero(enough & (count > 0))
+    return (2 * count >= count.max(initial=0)) & (count > 0)
+
+
+def _drawn(curve: Curve, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frame numbers, means and bounds; NaN, a gap in the line, at frames that are not drawn."""
+    mean, low, high = (np.where(kept, one[: len(kept)], np.nan) for one in (curve.mean, curve.low, curve.high))
+    return np.arange(len(kept)), mean, low, high
 
 
 def score_figure(path: Path, panels: Sequence[Panel], *, scores: Sequence[str] = ("iou", "cle_px")) -> None:
     """TagAttention, Figs. 10, 12, 14, 16, 17, 19: means with the 95 % band of the mean by recording, where there are several."""
     figure = sheet(2.15 * len(scores) + 0.45)
     grid = np.asarray(figure.subplots(len(scores), len(panels), sharex=True, sharey="row", squeeze=False))
-    handles: dict[str, object] = {}
-    order = list(dict.fromkeys(name for panel in panels for name in panel.lines))
     for column, panel in enumerate(panels):
         for row, score in enumerate(scores):
             axes = grid[row][column]
-            for name, by_score in panel.lines.items():
-                number = order.index(name)
-                curve, at = by_score[score], shown(by_score[score])
+            for number, (name, by_score) in enumerate(panel.lines.items()):
+                kept = shown(by_score[score])
+                frame, mean, low, high = _drawn(by_score[score], kept)
                 colour, dash = LINES[number % len(LINES)], DASHES[number % len(DASHES)]
-                (line,) = axes.plot(at, curve.mean[at], color=colour, linestyle=dash, linewidth=1.4)
-                handles.setdefault(name, line)
-                axes.fill_between(at, curve.low[at], curve.high[at], color=colour, alpha=0.16, linewidth=0)
+                axes.plot(frame, mean, color=colour, linestyle=dash, linewidth=1.4, label=name)
+                axes.fill_between(frame, low, high, color=colour, alpha=0.16, linewidth=0)
             tidy(axes, title=panel.title if row == 0 else "", ylabel=SCORES[score] if column == 0 else "")
             axes.set_xlim(0, NUM_FRAMES)
             axes.set_ylim(bottom=0, top=1.02 if score == "iou" else None)
-            if row == len(scores) - 1:
-                axes.set_xlabel("frames since the first motion", fontsize=FONT)
-    figure.legend(
-        list(handles.values()), list(handles), loc="outside upper center", ncols=3, fontsize=FONT, frameon=False
-    )
+    figure.supxlabel("frames since the first motion", fontsize=FONT)
+    if all(list(panel.lines) == list(panels[0].lines) for panel in panels):
+        handles = grid[0][0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside upper center", ncols=3, fontsize=FONT, frameon=False)
+    else:
+        for axes in grid[-1]:
+            axes.legend(fontsize=FONT - 0.5, loc="upper right")
     save_small(figure, path)
