@@ -43,8 +43,9 @@ class PaperConfig:
     workers: int = 1  # processes that simulate
 
     def __post_init__(self) -> None:
-        if not self.splits or (unknown := sorted(set(self.splits) - set(SPLITS))):
-            found = ", ".join(unknown) if self.splits else "none"
+        unknown = sorted(set(self.splits) - set(SPLITS))
+        if unknown or not self.splits:
+            found = ", ".join(unknown) or "none"
             raise ConfigError(f"splits: found {found}; expected some of {', '.join(SPLITS)}.")
         if missing := {LEARNABLE, PUBLISHED} - set(self.tracers):
             raise ConfigError(f"tracers: found no {', '.join(sorted(missing))}; expected {LEARNABLE} and {PUBLISHED}.")

@@ -163,12 +163,14 @@ def _cell(recording: Recording, picture: Picture, true_boxes: np.ndarray, title:
 
 def _scores_text(scores: Sequence[FrameScores], frame: int) -> str:
     """IoU and centre error of one tag, or the IoUs of several; a dash where a tag is not detected or not to be seen."""
+    seen = [bool(np.isfinite(one.cle_px[frame])) for one in scores]
     if len(scores) == 1:
         (one,) = scores
         if not one.detected[frame]:
             return "not detected"
-        return f"IoU {one.iou[frame]:.2f}, {one.cle_px[frame]:.0f} px" if np.isfinite(one.iou[frame]) else "out of view"
-    texts = [f"{one.iou[frame]:.2f}" if one.detected[frame] and np.isfinite(one.iou[frame]) else "-" for one in scores]
+        return f"IoU {one.iou[frame]:.2f}, {one.cle_px[frame]:.0f} px" if seen[0] else "detected, not in view"
+    known = [one.detected[frame] and there for one, there in zip(scores, seen, strict=True)]
+    texts = [f"{one.iou[frame]:.2f}" if there else "-" for one, there in zip(scores, known, strict=True)]
     return f"IoU {' '.join(texts)}"
 
 

@@ -168,7 +168,8 @@ FIGURES: dict[str, PaperFigure] = {
     "tagview_9": PaperFigure(
         TAGVIEW, 9, _CEILING, ceiling.systems,
         "Traces (of TagVision: tags) that are identified by Tagview, by TagVision with a calibrated camera, and by TagVision with a camera that was "
-        "moved by 0.4 m and turned by 20 degrees since its calibration; bars: 95 % interval by recording.",
+        "moved by 0.4 m and turned by 20 degrees since its calibration; black: 95 % interval by recording. TagVision has the settings that were "
+        "chosen for balls on a table (`planar_tracks`).",
         "Tagview and calibrated TagVision 0.98; without calibration TagVision is below 0.30.",
     ),
     "tagview_10": PaperFigure(

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from ..overlay import PALETTE_RGB
 from .style import FONT, Crop, box, outline, save_small, sheet, show
@@ -48,9 +50,9 @@ def strip_figure(path: Path, rows: Sequence[Row], *, names: Sequence[str] = ()) 
             show(axes, _painted(cell), row.crop, title=cell.title, below=cell.below)
             for true_box in cell.true_boxes_px:
                 box(axes, true_box, "white", dashed=True, width=1.1)
-            for tag in np.flatnonzero(cell.detected):
+            for tag in np.flatnonzero(cell.detected).tolist():  # boxes that coincide stay visible: the first is thicker
                 outline(axes, cell.masks[tag], _colour(tag), width=0.7)
-                box(axes, cell.boxes_px[tag], _colour(tag))
+                box(axes, cell.boxes_px[tag], _colour(tag), width=1.4 if tag else 2.8)
         grid[number][0].set_ylabel(row.label, fontsize=FONT)
         for axes in grid[number][len(row.cells) :]:
             axes.set_axis_off()
@@ -59,9 +61,7 @@ def strip_figure(path: Path, rows: Sequence[Row], *, names: Sequence[str] = ()) 
     save_small(figure, path)
 
 
-def _legend(figure, names: Sequence[str]) -> None:  # type: ignore[no-untyped-def]
-    from matplotlib.lines import Line2D
-
+def _legend(figure: Figure, names: Sequence[str]) -> None:
     handles = [Line2D([], [], color=_colour(tag), linewidth=2.5) for tag in range(len(names))]
     figure.legend(handles, list(names), loc="outside lower center", ncols=len(names), fontsize=FONT, frameon=False)
 
@@ -75,6 +75,6 @@ def _painted(cell: Cell) -> np.ndarray:
     return picture.astype(np.uint8)
 
 
-def _colour(tag: int) -> tuple[float, float, float]:
-    red, green, blue = PALETTE_RGB[int(tag) % len(PALETTE_RGB)]
-    return red / 255, green / 255, blue / 255
+def _colour(tag: int) -> str:
+    red, green, blue = PALETTE_RGB[tag % len(PALETTE_RGB)]
+    return f"#{red:02x}{green:02x}{blue:02x}"
