@@ -54,7 +54,8 @@ def score_figure(path: Path, panels: Sequence[Panel], *, scores: Sequence[str] =
                 axes.fill_between(frame, low, high, color=colour, alpha=0.16, linewidth=0)
             tidy(axes, title=panel.title if row == 0 else "", ylabel=SCORES[score] if column == 0 else "")
             axes.set_xlim(0, NUM_FRAMES)
-            axes.set_ylim(bottom=0, top=1.02 if score == "iou" else None)
+    for score, row in zip(scores, grid, strict=True):  # when all is drawn: panels of a row share their limits
+        row[0].set_ylim(bottom=0, top=1.02 if score == "iou" else None)
     figure.supxlabel("frames since the first motion", fontsize=FONT)
     if all(list(panel.lines) == list(panels[0].lines) for panel in panels):
         handles = grid[0][0].get_legend_handles_labels()

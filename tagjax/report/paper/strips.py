@@ -52,7 +52,7 @@ def strip_figure(path: Path, rows: Sequence[Row], *, names: Sequence[str] = ()) 
                 box(axes, true_box, "white", dashed=True, width=1.1)
             for tag in np.flatnonzero(cell.detected).tolist():  # boxes that coincide stay visible: the first is thicker
                 outline(axes, cell.masks[tag], _colour(tag), width=0.7)
-                box(axes, cell.boxes_px[tag], _colour(tag), width=1.4 if tag else 2.8)
+                box(axes, cell.boxes_px[tag], _colour(tag), width=2.8 if tag == 0 and len(cell.masks) > 1 else 1.4)
         grid[number][0].set_ylabel(row.label, fontsize=FONT)
         for axes in grid[number][len(row.cells) :]:
             axes.set_axis_off()
