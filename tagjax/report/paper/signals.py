@@ -39,7 +39,7 @@ def phase_figure(
 
 def synchronisation_figure(
     path: Path,
-    read_s: Mapping[str, Float[np.ndarray, "_"]],
+    read_s: Mapping[str, Float[np.ndarray, " _"]],
     shown: str,
     at_reads_m: Float[np.ndarray, " reads"],
     frame_s: Float[np.ndarray, " frames"],
