@@ -110,7 +110,9 @@ def run_tagview(config: TagviewExperiment, folder: Path, *, on_progress: OnProgr
         if reason is not None:
             raise ValueError(f"{recording.name}: Tagview does not apply: {reason}")
         tracked = track_recording(tracer, recording)
-        for name, score in _score_settings(config, tracer, recording, tracked).items():
+        for name, score in score_settings(
+            config.matching, config.system.min_trace_s, tracer, recording, tracked
+        ).items():
             scores.setdefault(group, {}).setdefault(name, []).append(score)
         mm_per_px.append(tracked.mm_per_px)
         num_rows = recording.image_shape[0]
@@ -130,15 +132,19 @@ def run_tagview(config: TagviewExperiment, folder: Path, *, on_progress: OnProgr
     return metrics
 
 
-def _score_settings(
-    config: TagviewExperiment, tracer: TagviewTracer, recording: Recording, tracked: TrackedRecording
+def score_settings(
+    matching: Mapping[str, Matching],
+    min_trace_s: float,
+    tracer: TagviewTracer,
+    recording: Recording,
+    tracked: TrackedRecording,
 ) -> dict[str, RecordingScore]:
-    """The recording's score with every setting."""
+    """The recording's score with every setting, on the same tracks; traces shorter than `min_trace_s` do not count."""
     carrier_hz = float(np.nanmedian(recording.reads.carrier_hz))
     true_slope = 4 * np.pi * plane_depth_m(recording) * carrier_hz / SPEED_OF_LIGHT_M_S
-    min_frames = max(round(config.system.min_trace_s * recording.frame_rate_hz), 1)
+    min_frames = max(round(min_trace_s * recording.frame_rate_hz), 1)
     scores = {}
-    for name, setting in config.matching.items():
+    for name, setting in matching.items():
         found, _ = tracer.identify(tracked.camera, tracked.state, setting.match, setting.reads)
         scores[name] = score_recording(tracked, found, min_frames=min_frames, true_slope=true_slope)
     return scores
