@@ -95,6 +95,8 @@ class LlrpReader(AbstractReader):
         client = reader.client
         rospec = self._rospec(reader)
         check_status(await client.transact(_reader_config(self.connection.silence_s)))
+        with contextlib.suppress(self._llrpkit.LLRPStatusError):  # a model that does not know it reports as it does
+            check_status(await client.transact(_low_latency()))
         # What the reader kept from an earlier connection has arrived by now, and stays in the queue of reports.
         with contextlib.suppress(self._llrpkit.LLRPStatusError):  # it has no such ROSpec
             check_status(await client.transact(messages.DELETE_ROSPEC(ro_spec_id=_ROSPEC)))
@@ -239,6 +241,16 @@ def _reader_config(keepalive_s: float) -> Any:
             ]
         ),
     )
+
+
+def _low_latency() -> Any:
+    """SET_READER_CONFIG with Impinj's buffer mode in which each report is sent at once: delays show the clocks' relation."""
+    from llrpkit.protocol import impinj, messages
+
+    mode = impinj.ImpinjReportBufferMode.Low_Latency
+    message = messages.SET_READER_CONFIG(reset_to_factory_default=False)
+    message.custom.append(impinj.ImpinjReportBufferConfiguration(report_buffer_mode=mode))
+    return message
 
 
 def _events(message: Any) -> Iterator[ReaderEvent]:

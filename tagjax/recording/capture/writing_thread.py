@@ -17,7 +17,9 @@ from .progress import Progress
 from .reads import CapturedRead, ReaderEvent, ReaderInfo
 from .writer import RecordingWriter, VideoFormat
 
-MAX_FRAMES = 32
+MAX_FRAME_BYTES = 1 << 28
+"""Of frames that wait to be written: some 170 of 640 x 480 pixels."""
+
 MAX_READS = 200_000
 _PREVIEW_WIDTH = 320
 
@@ -35,12 +37,14 @@ class WritingThread:
         *,
         commit_s: float = 0.5,
         preview: Path | None = None,  # a picture file of the last frame
+        max_frame_bytes: int = MAX_FRAME_BYTES,
     ):
         self.error: Exception | None = None
         self.writer: RecordingWriter | None = None
         self._make, self._progress, self._commit_s, self._preview = make, progress, commit_s, preview
         self._waiting: collections.deque[Any] = collections.deque()
-        self._num_frames = self._num_reads = 0
+        self._max_bytes = max_frame_bytes
+        self._num_bytes = self._num_reads = 0
         self._changed, self._closing = threading.Condition(), False
         self._thread = threading.Thread(target=self._run, name="writing", daemon=True)
         self._thread.start()
@@ -49,8 +53,8 @@ class WritingThread:
         """Hand over something to be written. A frame or a read for which there is no room is dropped and counted."""
         with self._changed:
             if isinstance(item, CameraFrame):
-                fits = self._num_frames < MAX_FRAMES
-                self._num_frames += fits
+                fits = self._num_bytes + _num_bytes(item) <= self._max_bytes
+                self._num_bytes += fits * _num_bytes(item)
                 self._progress.frame(item, fits)
             elif isinstance(item, CapturedRead):
                 fits = self._num_reads < MAX_READS
@@ -108,7 +112,7 @@ class WritingThread:
         if isinstance(item, CameraFrame):
             writer.add_frame(item.colour, item.depth, item.arrival_time_ns, item.device_time_ns)
             with self._changed:
-                self._num_frames -= 1
+                self._num_bytes -= _num_bytes(item)
         elif isinstance(item, CapturedRead):
             writer.add_reads([item])
         elif isinstance(item, ReaderInfo):
@@ -121,6 +125,10 @@ class WritingThread:
         frame = self._progress.last_frame
         if self._preview is not None and frame is not None:
             write_preview(self._preview, frame)
+
+
+def _num_bytes(frame: CameraFrame) -> int:
+    return frame.colour.nbytes + frame.depth.nbytes
 
 
 def write_preview(path: Path, frame: CameraFrame) -> None:
