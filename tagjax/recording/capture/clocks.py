@@ -34,7 +34,8 @@ def sensor_times(sensor_ns: np.ndarray, arrival_ns: np.ndarray) -> SensorTimes:
     try:
         found = to_host_clock(sensor_ns, arrival_ns, short_drift_error_s=SHORT_DRIFT_ERROR_S)
     except RecordingError as error:
-        return SensorTimes(np.array(arrival_ns, np.int64), None, f"times of arrival are used: {error}")
+        found_text = str(error).split(" Import with ")[0]  # an importer's advice
+        return SensorTimes(np.array(arrival_ns, np.int64), None, f"times of arrival are used: {found_text}")
     return SensorTimes(np.minimum(found.time_ns, arrival_ns), found.audit)
 
 

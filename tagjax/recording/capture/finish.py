@@ -45,7 +45,7 @@ def finish_recording(path: str | Path) -> Finished:
     with writing(path):
         arrays = {name: zarr.open_array(str(path / name), mode="r+", zarr_format=3) for name in counts}
         _cut_to_what_is_there(path, arrays, counts)
-        frames, reads = _frame_times(arrays, counts), _read_times(arrays, counts)
+        frames, reads = _named("camera", _frame_times(arrays, counts)), _named("reader", _read_times(arrays, counts))
         arrays["time_ns"][: len(frames.time_ns)] = frames.time_ns
         arrays["reads/time_ns"][: len(reads.time_ns)] = reads.time_ns
         for name, array in arrays.items():  # what was written after the last commit goes
@@ -108,6 +108,10 @@ def _frame_times(arrays: dict[str, zarr.Array], counts: dict[str, int]) -> Senso
     if found.audit is not None and np.all(np.diff(found.time_ns) > 0):
         return found
     return SensorTimes(stored, None, found.note or "the camera's times do not increase: times of arrival are used")
+
+
+def _named(sensor: str, times: SensorTimes) -> SensorTimes:
+    return dataclasses.replace(times, note=f"{sensor}: {times.note}") if times.note else times
 
 
 def _read_times(arrays: dict[str, zarr.Array], counts: dict[str, int]) -> SensorTimes:
