@@ -124,7 +124,7 @@ FIGURES: dict[str, PaperFigure] = {
     ),
     "16": PaperFigure(
         TAGATTENTION, 16, (Recordings("speed"),), curves.by_variant,
-        "A person with a badge walks towards the sensor and away at four speeds. " + _BAND,
+        "A person with a badge walks towards the sensor and away at four speeds; gaps: the picture's edge cuts the person off. " + _BAND,
         "At every speed the person is found and kept after around 25 frames, sooner at high speed.",
     ),
     "17": PaperFigure(
