@@ -1,0 +1,133 @@
+"""A recording traced as if its sensors were running: latency, dropped frames, events, and every frame's result as a line of JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ..core.camera import working_stride
+from ..core.machine import peak_memory_mib
+from ..core.results import to_json_values, write_json
+from ..core.settings import ConfigError
+from ..flow.registry import make_flow
+from ..recording import Recording
+from ..recording.store import open_recording
+from ..tagattention.tracer_settings import make_tracer, tracer_clips
+from ..tracing.clips import choose_antennas, selected_tags
+from ..tracing.live import LiveMethod, LiveTracer
+from ..tracing.replay import Replay, ReplaySettings, SensorFrame
+from .event_log import EventLog, EventSettings
+from .results import Totals, sightings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StreamConfig:
+    """The recording and how it is played, and the tracer (settings as under conf/tracer, or learned weights)."""
+
+    recording: str
+    tracer: Mapping[str, Any]
+    weights: str | None = None
+    flow: str = "dis_live"
+    stride: int | None = None  # None: that of the tracer's settings, or else of the picture's width
+    num_places: int = 4  # for tags, before more are made
+    replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)
+    events: EventSettings = dataclasses.field(default_factory=EventSettings)
+
+
+def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], None] | None = None) -> dict[str, Any]:
+    """Trace the recording live; the summary, which is also written to stream.json.
+
+    Writes a line a frame to frames.jsonl and a line an event to events.jsonl as it goes. Ctrl-C ends the stream, and the
+    summary covers what was traced. Raises `ConfigError` for a tracer that does not run live.
+    """
+    tracer = make_tracer(config.tracer, config.weights)
+    if not isinstance(tracer, LiveMethod):
+        raise ConfigError(
+            f"tracer: found {config.tracer.get('_target_')}; expected one that runs live, as TagAttention does."
+        )
+    recording = open_recording(config.recording)
+    own = tracer_clips(config.tracer).stride if config.stride is None else config.stride
+    stride = working_stride(recording.intrinsics.width, own)
+    live = _live_tracer(config, tracer, recording, stride)
+    start_s = live.warm_up()
+    folder.mkdir(parents=True, exist_ok=True)
+    totals, begun = Totals(), time.monotonic()
+    with contextlib.ExitStack() as stack:
+        lines = stack.enter_context((folder / "frames.jsonl").open("w"))
+        events = EventLog(config.events, stack.enter_context((folder / "events.jsonl").open("w")))
+        stack.callback(events.close)
+        replay = stack.enter_context(contextlib.closing(Replay(recording, config.replay)))
+        following = _Following(live, stride, recording.image_shape, totals, lines, events)
+        interrupted = _followed(following, replay, on_frame)
+        lasted_s = time.monotonic() - begun
+    summary = {
+        **totals.summary(),
+        "dropped_frames": replay.num_dropped,
+        "camera_moved": live.camera_moved,
+        "frames_per_s": round(totals.num_frames / max(lasted_s, 1e-9), 2),
+        "start_s": round(start_s, 2),
+        "events": events.summary(),
+        "memory_mib": round(peak_memory_mib()),
+        "interrupted": interrupted,
+    }
+    write_json(folder / "stream.json", to_json_values(summary))
+    return summary
+
+
+def _live_tracer(config: StreamConfig, tracer: LiveMethod, recording: Recording, stride: int) -> LiveTracer:
+    return LiveTracer(
+        tracer,
+        recording.intrinsics,
+        recording.antennas_m,
+        flow=make_flow(config.flow),
+        stride=stride,
+        antennas=choose_antennas(recording, selected_tags(recording, None)),
+        depth_kind=recording.depth_kind,
+        num_places=config.num_places,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Following:
+    """What happens with each frame."""
+
+    live: LiveTracer
+    stride: int
+    shape: tuple[int, int]
+    totals: Totals
+    lines: io.TextIOBase
+    events: EventLog
+
+    def __call__(self, frame: SensorFrame) -> str:
+        """Trace a frame and hand its result on; a line for people."""
+        taken = time.monotonic()
+        found = self.live.process(frame.colour, frame.depth_m, frame.time_ns, frame.reads)
+        jax.block_until_ready(found.trace)
+        done = time.monotonic()
+        tags = sightings(found, self.stride, self.shape)
+        self.totals.add(found, tags, done - taken, done - frame.due_s)
+        line = {"time_ns": found.time_ns, "tags": {epc: dataclasses.asdict(tag) for epc, tag in tags.items()}}
+        self.lines.write(json.dumps(line) + "\n")
+        self.events.add(found.time_ns, tags)
+        states = ", ".join(f"{epc} {tag.status}" for epc, tag in tags.items()) or "no tag"
+        return f"frame {self.totals.num_frames}: {self.totals.computing.percentile(50):.0f} ms; {states}"
+
+
+def _followed(following: _Following, frames: Replay, on_frame: Callable[[str], None] | None) -> bool:
+    """Follow all frames; whether Ctrl-C ended it."""
+    try:
+        for frame in frames:
+            text = following(frame)
+            if on_frame is not None:
+                on_frame(text)
+    except KeyboardInterrupt:
+        return True
+    return False
