@@ -5,6 +5,8 @@ python -m experiments.stream recording=a.zarr replay.real_time=false      # as f
 python -m experiments.stream recording=a.zarr replay.real_time=false replay.loops=100
 python -m experiments.stream recording=a.zarr events=stdout events.webhook=http://127.0.0.1:9000/tags 'events.regions=[{name: exit, floor_m: [[-1,0],[1,0],[1,2],[-1,2]]}]'
 
+python -m experiments.stream recording=a.zarr page.port=8080      # a web page: http://127.0.0.1:8080/
+
 frames.jsonl has a line a frame: time, and for each tag box, place, confidence, and status: detected, or the reason why not. events.jsonl has
 a line an event: a tag was detected, was lost, raised an alarm in a region, or left through it. Ctrl-C ends the stream and keeps all lines.
 """
@@ -25,8 +27,12 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = checked(StreamConfig, values, folder)
+
+    def shown(address: str) -> None:
+        console.print(f"the page: {address}", soft_wrap=True, highlight=False)
+
     with console.status("compiling") as status:
-        summary = run_stream(config, folder, on_frame=status.update if progress else None)
+        summary = run_stream(config, folder, on_frame=status.update if progress else None, on_page=shown)
     console.print(
         f"{summary['frames']} frames at {summary['frames_per_s']:.1f}/s, {summary['dropped_frames']} dropped; a frame took "
         f"{summary['process_ms']['p50']:.1f} ms (median), {summary['process_ms']['p99']:.1f} ms (99 %); its result came "

@@ -25,6 +25,8 @@ from ..tracing.clips import choose_antennas, selected_tags
 from ..tracing.live import LiveMethod, LiveTracer
 from ..tracing.replay import Replay, ReplaySettings, SensorFrame
 from .event_log import EventLog, EventSettings
+from .feed import Feed
+from .page import LivePage, PageSettings
 from .results import Totals, sightings
 
 
@@ -40,13 +42,20 @@ class StreamConfig:
     num_places: int = 4  # for tags, before more are made
     replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)
     events: EventSettings = dataclasses.field(default_factory=EventSettings)
+    page: PageSettings = dataclasses.field(default_factory=PageSettings)
 
 
-def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], None] | None = None) -> dict[str, Any]:
+def run_stream(
+    config: StreamConfig,
+    folder: Path,
+    *,
+    on_frame: Callable[[str], None] | None = None,
+    on_page: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
     """Trace the recording live; the summary, which is also written to stream.json.
 
     Writes a line a frame to frames.jsonl and a line an event to events.jsonl as it goes. Ctrl-C ends the stream, and the
-    summary covers what was traced. Raises `ConfigError` for a tracer that does not run live.
+    summary covers what was traced. `on_page` is called with the address of the web page once it is served. Raises `ConfigError` for a tracer that does not run live.
     """
     tracer = make_tracer(config.tracer, config.weights)
     if not isinstance(tracer, LiveMethod):
@@ -65,7 +74,8 @@ def run_stream(config: StreamConfig, folder: Path, *, on_frame: Callable[[str], 
         events = EventLog(config.events, stack.enter_context((folder / "events.jsonl").open("w")))
         stack.callback(events.close)
         replay = stack.enter_context(contextlib.closing(Replay(recording, config.replay)))
-        following = _Following(live, stride, recording.image_shape, totals, lines, events)
+        feed = _feed(config, stack, recording, live, stride, replay, events, on_page)
+        following = _Following(live, stride, recording.image_shape, totals, lines, events, feed)
         interrupted = _followed(following, replay, on_frame)
         lasted_s = time.monotonic() - begun
     summary = {
@@ -95,6 +105,30 @@ def _live_tracer(config: StreamConfig, tracer: LiveMethod, recording: Recording,
     )
 
 
+def _feed(
+    config: StreamConfig,
+    stack: contextlib.ExitStack,
+    recording: Recording,
+    live: LiveTracer,
+    stride: int,
+    replay: Replay,
+    events: EventLog,
+    on_page: Callable[[str], None] | None,
+) -> Feed | None:
+    """The web page, served until the stack unwinds; None without one."""
+    if config.page.port is None:
+        return None
+    page = stack.enter_context(contextlib.closing(LivePage(config.page, f"tagjax: {recording.name}")))
+    if on_page is not None:
+        on_page(page.address)
+
+    def notes() -> list[str]:
+        moved = ["the camera has moved, which misleads the tracer"] if live.camera_moved else []
+        return [*moved, *events.problems()]
+
+    return Feed(page, stride, config.page.width, num_dropped=lambda: replay.num_dropped, notes=notes)
+
+
 @dataclasses.dataclass(frozen=True)
 class _Following:
     """What happens with each frame."""
@@ -105,6 +139,7 @@ class _Following:
     totals: Totals
     lines: io.TextIOBase
     events: EventLog
+    feed: Feed | None
 
     def __call__(self, frame: SensorFrame) -> str:
         """Trace a frame and hand its result on; a line for people."""
@@ -116,7 +151,9 @@ class _Following:
         self.totals.add(found, tags, done - taken, done - frame.due_s)
         line = {"time_ns": found.time_ns, "tags": {epc: dataclasses.asdict(tag) for epc, tag in tags.items()}}
         self.lines.write(json.dumps(line) + "\n")
-        self.events.add(found.time_ns, tags)
+        events = self.events.add(found.time_ns, tags)
+        if self.feed is not None:
+            self.feed.add(frame, found, tags, events, self.totals)
         states = ", ".join(f"{epc} {tag.status}" for epc, tag in tags.items()) or "no tag"
         return f"frame {self.totals.num_frames}: {self.totals.computing.percentile(50):.0f} ms; {states}"
 
