@@ -1,4 +1,4 @@
-"""Trace a recording as if its sensors were running; the last line is the result as JSON.
+"""Trace a recording as if its sensors were running, or running sensors; the last line is the result as JSON.
 
 python -m experiments.stream recording=a.zarr                            # in real time: frames that are late are dropped
 python -m experiments.stream recording=a.zarr replay.real_time=false      # as fast as it goes, every frame
@@ -6,6 +6,8 @@ python -m experiments.stream recording=a.zarr replay.real_time=false replay.loop
 python -m experiments.stream recording=a.zarr events=stdout events.webhook=http://127.0.0.1:9000/tags 'events.regions=[{name: exit, floor_m: [[-1,0],[1,0],[1,2],[-1,2]]}]'
 
 python -m experiments.stream recording=a.zarr page.port=8080      # a web page: http://127.0.0.1:8080/
+python -m experiments.stream camera=realsense reader=llrp address=192.168.1.10 'antennas_m=[[0.2,0.0,0.0]]' record=recordings/a.zarr
+python -m experiments.stream camera=playback reader=llrp emulate=true recording=a.zarr     # the same without any hardware
 
 frames.jsonl has a line a frame: time, and for each tag box, place, confidence, and status: detected, or the reason why not. events.jsonl has
 a line an event: a tag was detected, was lost, raised an alarm in a region, or left through it. Ctrl-C ends the stream and keeps all lines.
@@ -23,7 +25,8 @@ from .command import checked, command, print_result
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
-    from tagjax.live.stream import StreamConfig, run_stream
+    from tagjax.live.config import StreamConfig
+    from tagjax.live.stream import run_stream
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = checked(StreamConfig, values, folder)

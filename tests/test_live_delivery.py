@@ -14,10 +14,10 @@ import pytest
 from composed import settings
 
 from tagjax.core.settings import ConfigError
+from tagjax.live.config import StreamConfig
 from tagjax.live.event_log import EventLog, EventSettings
 from tagjax.live.events import Sighting
 from tagjax.live.outlet import DeliveryError, Outlet, OutletSettings
-from tagjax.live.stream import StreamConfig
 from tagjax.live.webhook import TOKEN, webhook
 
 QUICK = OutletSettings(queue=5, attempts=3, first_delay_s=0.01, max_delay_s=0.02, timeout_s=2.0, close_s=2.0)

@@ -1,4 +1,4 @@
-"""A recording traced as if its sensors were running: latency, dropped frames, events, and every frame's result as a line of JSON."""
+"""A recording traced as if its sensors were running, or running sensors: latency, dropped frames, events, and every frame's result as a line of JSON."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import io
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,31 +18,15 @@ from ..core.machine import peak_memory_mib
 from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..flow.registry import make_flow
-from ..recording import Recording
-from ..recording.store import open_recording
 from ..tagattention.tracer_settings import make_tracer, tracer_clips
-from ..tracing.clips import choose_antennas, selected_tags
 from ..tracing.live import LiveMethod, LiveTracer
-from ..tracing.replay import Replay, ReplaySettings, SensorFrame
-from .event_log import EventLog, EventSettings
+from ..tracing.replay import Replay, SensorFrame
+from .config import Source, StreamConfig, open_source
+from .event_log import EventLog
 from .feed import Feed
-from .page import LivePage, PageSettings
+from .page import LivePage
 from .results import Totals, sightings
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StreamConfig:
-    """The recording and how it is played, and the tracer (settings as under conf/tracer, or learned weights)."""
-
-    recording: str
-    tracer: Mapping[str, Any]
-    weights: str | None = None
-    flow: str = "dis_live"
-    stride: int | None = None  # None: that of the tracer's settings, or else of the picture's width
-    num_places: int = 4  # for tags, before more are made
-    replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)
-    events: EventSettings = dataclasses.field(default_factory=EventSettings)
-    page: PageSettings = dataclasses.field(default_factory=PageSettings)
+from .sensors import SensorStream
 
 
 def run_stream(
@@ -52,39 +36,42 @@ def run_stream(
     on_frame: Callable[[str], None] | None = None,
     on_page: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
-    """Trace the recording live; the summary, which is also written to stream.json.
+    """Trace a recording or running sensors; the summary, which is also written to stream.json.
 
     Writes a line a frame to frames.jsonl and a line an event to events.jsonl as it goes. Ctrl-C ends the stream, and the
-    summary covers what was traced. `on_page` is called with the address of the web page once it is served. Raises `ConfigError` for a tracer that does not run live.
+    summary covers what was traced. `on_page` is called with the address of the web page once it is served. Raises
+    `ConfigError` for a tracer that does not run live, and the errors of `open_source` and of running sensors.
     """
     tracer = make_tracer(config.tracer, config.weights)
     if not isinstance(tracer, LiveMethod):
         raise ConfigError(
             f"tracer: found {config.tracer.get('_target_')}; expected one that runs live, as TagAttention does."
         )
-    recording = open_recording(config.recording)
-    own = tracer_clips(config.tracer).stride if config.stride is None else config.stride
-    stride = working_stride(recording.intrinsics.width, own)
-    live = _live_tracer(config, tracer, recording, stride)
-    start_s = live.warm_up()
     folder.mkdir(parents=True, exist_ok=True)
-    totals, begun = Totals(), time.monotonic()
+    totals = Totals()
     with contextlib.ExitStack() as stack:
+        source = open_source(config, stack)
+        own = tracer_clips(config.tracer).stride if config.stride is None else config.stride
+        stride = working_stride(source.intrinsics.width, own)
+        live = _live_tracer(config, tracer, source, stride)
+        start_s = live.warm_up()
         lines = stack.enter_context((folder / "frames.jsonl").open("w"))
         events = EventLog(config.events, stack.enter_context((folder / "events.jsonl").open("w")))
         stack.callback(events.close)
-        replay = stack.enter_context(contextlib.closing(Replay(recording, config.replay)))
-        feed = _feed(config, stack, recording, live, stride, replay, events, on_page)
-        following = _Following(live, stride, recording.image_shape, totals, lines, events, feed)
-        interrupted = _followed(following, replay, on_frame)
+        frames, begun = source.start(), time.monotonic()
+        feed = _feed(config, stack, source.name, live, stride, frames, events, on_page)
+        shape = source.intrinsics.height, source.intrinsics.width
+        following = _Following(live, stride, shape, totals, lines, events, feed)
+        interrupted = _followed(following, frames, on_frame)
         lasted_s = time.monotonic() - begun
     summary = {
         **totals.summary(),
-        "dropped_frames": replay.num_dropped,
+        "dropped_frames": frames.num_dropped,
         "camera_moved": live.camera_moved,
         "frames_per_s": round(totals.num_frames / max(lasted_s, 1e-9), 2),
         "start_s": round(start_s, 2),
         "events": events.summary(),
+        **({} if isinstance(frames, Replay) else {"sensors": frames.summary()}),
         "memory_mib": round(peak_memory_mib()),
         "interrupted": interrupted,
     }
@@ -92,15 +79,15 @@ def run_stream(
     return summary
 
 
-def _live_tracer(config: StreamConfig, tracer: LiveMethod, recording: Recording, stride: int) -> LiveTracer:
+def _live_tracer(config: StreamConfig, tracer: LiveMethod, source: Source, stride: int) -> LiveTracer:
     return LiveTracer(
         tracer,
-        recording.intrinsics,
-        recording.antennas_m,
+        source.intrinsics,
+        source.antennas_m,
         flow=make_flow(config.flow),
         stride=stride,
-        antennas=choose_antennas(recording, selected_tags(recording, None)),
-        depth_kind=recording.depth_kind,
+        antennas=source.antennas,
+        depth_kind=source.depth_kind,
         num_places=config.num_places,
     )
 
@@ -108,25 +95,25 @@ def _live_tracer(config: StreamConfig, tracer: LiveMethod, recording: Recording,
 def _feed(
     config: StreamConfig,
     stack: contextlib.ExitStack,
-    recording: Recording,
+    name: str,
     live: LiveTracer,
     stride: int,
-    replay: Replay,
+    frames: Replay | SensorStream,
     events: EventLog,
     on_page: Callable[[str], None] | None,
 ) -> Feed | None:
     """The web page, served until the stack unwinds; None without one."""
     if config.page.port is None:
         return None
-    page = stack.enter_context(contextlib.closing(LivePage(config.page, f"tagjax: {recording.name}")))
+    page = stack.enter_context(contextlib.closing(LivePage(config.page, f"tagjax: {name}")))
     if on_page is not None:
         on_page(page.address)
 
     def notes() -> list[str]:
         moved = ["the camera has moved, which misleads the tracer"] if live.camera_moved else []
-        return [*moved, *events.problems()]
+        return [*moved, *([] if isinstance(frames, Replay) else frames.notes()), *events.problems()]
 
-    return Feed(page, stride, config.page.width, num_dropped=lambda: replay.num_dropped, notes=notes)
+    return Feed(page, stride, config.page.width, num_dropped=lambda: frames.num_dropped, notes=notes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +145,7 @@ class _Following:
         return f"frame {self.totals.num_frames}: {self.totals.computing.percentile(50):.0f} ms; {states}"
 
 
-def _followed(following: _Following, frames: Replay, on_frame: Callable[[str], None] | None) -> bool:
+def _followed(following: _Following, frames: Replay | SensorStream, on_frame: Callable[[str], None] | None) -> bool:
     """Follow all frames; whether Ctrl-C ended it."""
     try:
         for frame in frames:
