@@ -27,16 +27,18 @@ def run(values: dict[str, Any], folder: Path) -> None:
     from tagjax.benchmarks.stages import BenchmarkSettings, run_benchmark
     from tagjax.benchmarks.timing import Timing
     from tagjax.core.machine import machine
+    from tagjax.core.progress import progress_lines
     from tagjax.core.results import write_json
 
     console = Console(width=None if sys.stdout.isatty() else 140, markup=False)  # a file has no terminal width
+    progress = values.pop("progress")
     settings = checked(BenchmarkSettings, values, folder)
     timings, figures = [], []
     table = Table("what", "ours, ms", "peer", "peer, ms", "ratio", "first call, s", "memory, MiB")
     aims = Table("what", "measured", "aim: at most", "reached")
-    with console.status("measuring") as status:
+    with progress_lines(shown=progress, console=console) as report:
         result: dict[str, Any] = {}
-        for found in run_benchmark(settings, on_case=lambda name: status.update(f"measuring {name}")):
+        for found in run_benchmark(settings, on_progress=report):
             if isinstance(found, Timing):
                 line = f"{found.what}: {found.ours_ms:.2f} ms; {found.peer}: {found.peer_ms:.2f} ms"
                 first = f"{found.compile_s:.1f}" if found.compile_s else ""

@@ -24,14 +24,14 @@ def main(values: dict[str, Any], folder: Path) -> None:
         write_calibration,
         write_corners,
     )
+    from tagjax.core.progress import progress_lines
 
     if values["pictures"] is None:
         raise ValueError("found no pictures; expected pictures=<folder of pictures of the checkerboard>.")
-    settings, console = (
-        checked(CalibrateSettings, values, folder),
-        Console(soft_wrap=True, highlight=False, markup=False),
-    )
-    calibration = calibrate_folder(settings)
+    progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
+    settings = checked(CalibrateSettings, values, folder)
+    with progress_lines(shown=progress, console=console) as report:
+        calibration = calibrate_folder(settings, on_progress=report)
     write_calibration(calibration, settings.out)
     drawn = write_corners(calibration, settings.out)
     hint = (

@@ -18,6 +18,7 @@ from tagjax.core.folder_lock import locked_folder
 
 from .errors import ending_in_one_line, errors_in_one_line
 from .help import command_help
+from .resumption import resumable
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 """The folder of the configuration: beside `experiments` in a clone, and beside it in the installed package."""
@@ -27,18 +28,19 @@ T = TypeVar("T")
 OmegaConf.register_new_resolver("command_help", functools.partial(command_help, CONF), replace=True)
 
 
-def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], None]:
+def command(function: Callable[[dict[str, Any], Path], Any], *, resumes: bool = False) -> Callable[[], None]:
     """The entry point of a module `experiments/<name>.py`, configured by Hydra from conf/<name>.yaml.
 
     `function` receives the configuration as plain values and the run folder, whose lock it holds. A number that it returns
     is a sweep's objective. A command that can run in several processes (`distributed`) has them share the folder, so it takes
-    the lock itself in the process that writes.
+    the lock itself in the process that writes. If it `resumes` when it is started again in its folder, Ctrl-C and SIGTERM
+    print the command for that.
     """
     name = Path(function.__code__.co_filename).stem
 
     @functools.wraps(function)
     def run(config: DictConfig) -> Any:
-        with errors_in_one_line(name):
+        with resumable(name) if resumes else contextlib.nullcontext(), errors_in_one_line(name):
             values, folder = plain_values(config), Path(HydraConfig.get().runtime.output_dir)
             with contextlib.nullcontext() if "distributed" in values else locked_folder(folder):
                 return function(values, folder)
@@ -51,6 +53,10 @@ def command(function: Callable[[dict[str, Any], Path], Any]) -> Callable[[], Non
             configured()
 
     return main
+
+
+resumable_command = functools.partial(command, resumes=True)
+"""`command`, for one that resumes when it is started again in its run folder."""
 
 
 def plain_values(config: DictConfig) -> dict[str, Any]:

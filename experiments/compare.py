@@ -20,14 +20,15 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.compare import CompareConfig, console_table, run_comparison
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = from_mapping(CompareConfig, {**values, "suites": suites_named(values["suites"])})
     write_config(values, folder)
-    with console.status("comparing") as status:
-        cells = run_comparison(config, folder, on_progress=status.update if progress else None)
+    with progress_lines(shown=progress, console=console) as report:
+        cells = run_comparison(config, folder, on_progress=report)
     console.print(console_table(cells))
     console.print(f"table.md, table.csv, table.json and comparison.png in {folder}", soft_wrap=True, highlight=False)
     print_result([dataclasses.asdict(cell) for cell in cells])

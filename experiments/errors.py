@@ -45,6 +45,7 @@ def errors_in_one_line(command: str, *more: type[Exception]) -> Iterator[None]:
 def ending_in_one_line(command: str) -> Iterator[None]:
     """For the whole of a command, with Hydra's part: Ctrl-C and SIGTERM end it in one line, with status 130 and 143.
 
+    The notes of their exception follow, one a line.
     A run folder that Hydra cannot write and an error of a sweep's job that the user can correct (`ValueError`, `OSError`)
     end it in one line as well, with status 1.
     """
@@ -53,10 +54,10 @@ def ending_in_one_line(command: str) -> Iterator[None]:
         try:
             yield
         except KeyboardInterrupt as error:
-            raise _ended(command, signal_number(error)) from None
+            raise _ended(command, signal_number(error), error) from None
         except Exception as error:
             if (number := last_signal()) is not None:
-                raise _ended(command, number) from error
+                raise _ended(command, number, error) from error
             if TRACEBACK_WANTED:
                 raise
             if isinstance(error, CompactHydraException):  # Hydra has written it for the user
@@ -74,8 +75,10 @@ def ending_in_one_line(command: str) -> Iterator[None]:
             raise
 
 
-def _ended(command: str, number: int) -> SystemExit:
-    print(f"\n{command}: {message(number)}", file=sys.stderr, flush=True)
+def _ended(command: str, number: int, error: BaseException) -> SystemExit:
+    """Says what ended the command, and below it the notes of the exception: what is saved, and how to resume."""
+    lines = [f"{command}: {message(number)}", *getattr(error, "__notes__", ())]
+    print("", *lines, sep="\n", file=sys.stderr, flush=True)
     return SystemExit(exit_status(number))
 
 

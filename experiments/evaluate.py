@@ -39,7 +39,10 @@ def main(values: dict[str, Any], folder: Path) -> float:
     split, recordings_dir = values.pop("split"), values.pop("recordings_dir")
     config = from_mapping(EvaluateConfig, values)
     if suite is not None:
-        values["recordings"] = [*config.recordings, *suite_recordings(suite, split, recordings_dir, **options)]
+        values["recordings"] = [
+            *config.recordings,
+            *suite_recordings(suite, split, recordings_dir, **options, progress=config.progress),
+        ]
         config = from_mapping(EvaluateConfig, values)
     write_config(values, folder)
     summary = run_evaluation(config, folder, run_values=run_configuration(config.run))

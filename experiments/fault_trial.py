@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from .command import CONF, checked, command, print_result
-from .progress import counting_bar
 
 DOCS = CONF.parent / "docs"
 
@@ -25,6 +24,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from tagjax.benchmarks.faults.run import FaultTrialSettings, num_failed, rendered, run_trial
     from tagjax.core.files import write_atomic
+    from tagjax.core.progress import progress_lines
     from tagjax.evaluation.reproduce.markdown import replaced
     from tagjax.evaluation.reproduce.provenance import revision
 
@@ -40,14 +40,8 @@ def main(values: dict[str, Any], folder: Path) -> None:
         "commit": revision(CONF.parent, {})["commit"],
         "date_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    with counting_bar(console, shown=progress) as bar:
-        task = bar.add_task("faults", total=None)
-        results = run_trial(
-            settings,
-            path,
-            about=about,
-            on_progress=lambda name, done, total: bar.update(task, description=name, completed=done, total=total),
-        )
+    with progress_lines(shown=progress, console=console) as report:
+        results = run_trial(settings, path, about=about, on_progress=report)
     if page:
         text = (DOCS / "reliability.md").read_text(encoding="utf-8")
         write_atomic(DOCS / "reliability.md", replaced(text, "faults", rendered(results)))

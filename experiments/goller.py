@@ -19,11 +19,13 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
     from tagjax.baselines.goller.experiment import GollerExperiment, run_goller
+    from tagjax.core.progress import progress_lines
     from tagjax.recording.store import open_recording
 
-    config, console = checked(GollerExperiment, values, folder), Console(markup=False)
-    with console.status("tracking", spinner="line") as status:
-        metrics = run_goller(config, folder, open_recording=open_recording, on_progress=status.update)
+    progress, console = values.pop("progress"), Console(markup=False)
+    config = checked(GollerExperiment, values, folder)
+    with progress_lines(shown=progress, console=console) as report:
+        metrics = run_goller(config, folder, open_recording=open_recording, on_progress=report)
     console.print((folder / "tables.md").read_text(), markup=False)
     if metrics["handover"] is None:
         hint = "found no hand-over; `python -m experiments.simulate suite=shop_handover` makes recordings of some"

@@ -1,6 +1,9 @@
 """Import an RGB-D video, a table of tag reads, or both, as one recording.
 
 python -m experiments.import_recording reads=table.csv                          # only report what a table holds
+python -m experiments.import_recording video=take1.mp4 reads=table.csv out=recordings/a.zarr     # depth/ and camera.json beside it
+python -m experiments.import_recording video=<folder of colour/, depth/, camera.json> out=recordings/a.zarr
+python -m experiments.import_recording video=take1.bag reads=table.csv out=recordings/a.zarr      # or .mcap, .db3, .mkv
 python -m experiments.import_recording video=<TUM folder> reads=table.csv out=recordings/a.zarr
 python -m experiments.import_recording video=<jpg+mat folder> calibration=cam.mat fps=7 tracks=tracks.csv out=b.zarr
 """

@@ -22,14 +22,15 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.reads_ceiling import CeilingConfig, console_table, run_ceiling
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = from_mapping(CeilingConfig, {**values, "suites": suites_named(values["suites"])})
     write_config(values, folder)
-    with console.status("measuring") as status:
-        rows, _ = run_ceiling(config, folder, on_progress=status.update if progress else None)
+    with progress_lines(shown=progress, console=console) as report:
+        rows, _ = run_ceiling(config, folder, on_progress=report)
     console.print(console_table(rows))
     console.print(f"table.md, table.csv, result.json and ceiling.png in {folder}", soft_wrap=True, highlight=False)
     print_result([dataclasses.asdict(row) for row in rows])

@@ -17,13 +17,14 @@ from .command import command
 @command
 def main(values: dict[str, Any], folder: Path) -> None:
     from tagjax.core.folder_lock import locked_folder
+    from tagjax.core.progress import progress_lines
     from tagjax.report.page import write_page
 
     run, out = Path(str(values["run"])), values["out"]
     if not run.is_dir():
         raise FileNotFoundError(f"run={run}: found no such folder; expected a run folder of train or evaluate.")
-    with locked_folder(run):
-        page = write_page(run, None if out is None else Path(str(out)))
+    with locked_folder(run), progress_lines(shown=bool(values["progress"])) as report:
+        page = write_page(run, None if out is None else Path(str(out)), on_progress=report)
     print(page)
 
 

@@ -14,8 +14,7 @@ from typing import Any
 from hydra import compose
 from omegaconf import OmegaConf
 
-from .command import CONF, command, plain_values
-from .progress import counting_bar
+from .command import CONF, plain_values, resumable_command
 from .suites import suites_named
 
 ROOT = CONF.parent
@@ -34,10 +33,11 @@ def tracer_settings(name: str) -> dict[str, Any]:
     return plain_values(compose(f"{group}/{name}")[group])
 
 
-@command
+@resumable_command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.reproduce.markdown import rendered, write_pages
     from tagjax.evaluation.reproduce.recipe import Recipe
@@ -59,8 +59,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
         raise ValueError(f"found no table; expected table=<name>, one of {', '.join(one.name for one in recipes)}.")
     from tagjax.evaluation.reproduce.make import make_table  # needs the sim extra
 
-    with counting_bar(console, shown=values["progress"]) as bar:
-        task = bar.add_task(recipes[0].name, total=None)
+    with progress_lines(shown=values["progress"], console=console) as report:
         table = make_table(
             recipes[0],
             ROOT,
@@ -70,7 +69,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
             finished=Path(values["finished_dir"]),
             workers=values["workers"],
             confirm=values["confirm"],
-            on_progress=lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+            on_progress=report,
         )
     console.print(rendered(table))
 

@@ -12,20 +12,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from .command import checked, command
+from .command import checked, resumable_command
 
 
-@command
+@resumable_command
 def main(values: dict[str, Any], folder: Path) -> None:
     import os
 
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
     from tagjax.sim.contact_sheet import save_preview, save_sheet
     from tagjax.sim.suites import SimulateConfig, Suite, make_suite
-
-    from .progress import counting_bar
 
     if values.get("suite") is None:
         raise ValueError("found no suite; expected suite=<name>. `--help` lists the names.")
@@ -34,23 +33,21 @@ def main(values: dict[str, Any], folder: Path) -> None:
     suite = suite.smoke() if config.smoke else suite
     recordings_dir, console = Path(config.recordings_dir), Console(markup=False)
     if config.sheet is not None:
-        console.print(f"{suite.name}: {save_preview(suite, Path(config.sheet), workers=config.workers or 1)}")
+        with progress_lines(shown=config.progress, console=console) as report:
+            sheet = save_preview(suite, Path(config.sheet), workers=config.workers or 1, on_progress=report)
+        console.print(f"{suite.name}: {sheet}")
         return
     if config.budget is not None:
         from tagjax.sim.link_budgets import budget_lines
 
-        console.print("\n".join(budget_lines(suite, config.budget)), soft_wrap=True, highlight=False)
+        with progress_lines(shown=config.progress, console=console) as report:
+            lines = budget_lines(suite, config.budget, on_progress=report)
+        console.print("\n".join(lines), soft_wrap=True, highlight=False)
         return
     items = suite.items()
-    with counting_bar(console, shown=config.progress) as bar:
-        task = bar.add_task(suite.name, total=len(items))
-        bar.update(task, completed=sum(item.path(recordings_dir).exists() for item in items))
-        made = make_suite(
-            suite,
-            recordings_dir,
-            workers=config.workers or os.cpu_count() or 1,
-            on_done=lambda one: bar.update(task, advance=1, description=one.name),
-        )
+    with progress_lines(shown=config.progress, console=console) as report:
+        workers = config.workers or os.cpu_count() or 1
+        made = make_suite(suite, recordings_dir, workers=workers, on_progress=report)
     frames, elapsed_s = sum(one.num_frames for one in made), sum(one.elapsed_s for one in made)
     speed = f", {frames / elapsed_s:.1f} frames/s a process" if frames else ""
     sheet = save_sheet(suite, recordings_dir)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +27,29 @@ def suite_recordings(
     *,
     max_recordings: int | None = None,
     smoke: bool = False,
-    on_done: Callable[[Any], None] | None = None,
+    progress: bool = True,
 ) -> list[str]:
     """Paths of a suite's recordings of one split, simulated where they are missing.
 
-    `max_recordings` limits those of each variant. Raises `ValueError` if the suite has none in this split.
+    `max_recordings` limits those of each variant. On a terminal a line counts the simulated recordings, if `progress`.
+    Raises `ValueError` if the suite has none in this split.
     """
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
     from tagjax.sim.suites import Suite, make_items
 
     chosen = from_mapping(Suite, suite, where="suite")
     chosen = chosen.smoke() if smoke else chosen
     folder = Path(recordings_dir)
-    items = make_items(
-        chosen, folder, splits=(split,), max_per_variant=max_recordings, workers=os.cpu_count() or 1, on_done=on_done
-    )
+    with progress_lines(shown=progress) as report:
+        items = make_items(
+            chosen,
+            folder,
+            splits=(split,),
+            max_per_variant=max_recordings,
+            workers=os.cpu_count() or 1,
+            on_progress=report,
+        )
     if not items:
         raise ValueError(f"suite {chosen.name} has no {split} recording; expected some: set suite.counts.{split}.")
     return [str(item.path(folder)) for item in items]

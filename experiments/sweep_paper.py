@@ -13,27 +13,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from .command import command, print_result, write_config
+from .command import print_result, resumable_command, write_config
 from .suites import suites_named
 
 
-@command
+@resumable_command
 def main(values: dict[str, Any], folder: Path) -> float:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.sweep import SweepConfig, run_sweep, table
 
-    from .progress import counting_bar
-
     progress, console = values.pop("progress"), Console(markup=False)
     config = from_mapping(SweepConfig, {**values, "suites": suites_named(values["suites"])})
-    with counting_bar(console, shown=progress) as bar:
-        task = bar.add_task("sweep", total=None)
-
-        def report(done: int, total: int, name: str) -> None:
-            bar.update(task, completed=done, total=total or None, description=name)
-
+    with progress_lines(shown=progress, console=console) as report:
         write_config(values, folder)
         rows = table(run_sweep(config, folder, on_progress=report))
     console.print((folder / "table.md").read_text(), soft_wrap=True, highlight=False)

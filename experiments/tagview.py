@@ -20,9 +20,9 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
-    from rich.progress import Progress
 
     from tagjax.baselines.tagview.experiment import TagviewExperiment, report_markdown, run_tagview, train_tagview
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
 
     command_name, progress = values.pop("command"), values.pop("progress")
@@ -31,15 +31,9 @@ def main(values: dict[str, Any], folder: Path) -> None:
     suites_named(values["suites"])
     config, console = from_mapping(TagviewExperiment, values), Console(markup=False)
     write_config({"command": command_name, **values}, folder)
-    with Progress(console=console, disable=not progress) as bar:
-        task = bar.add_task("tagview", total=None)
-
-        def report(name: str, number: int, total: int) -> None:
-            bar.update(task, completed=number, total=total, description=name)
-
+    with progress_lines(shown=progress, console=console) as report:
         if command_name == "train":
-            steps = config.training.settings.num_steps
-            metrics = train_tagview(config, folder, on_step=lambda step, loss: report(f"loss {loss:.3f}", step, steps))
+            metrics = train_tagview(config, folder, on_progress=report)
         else:
             metrics = run_tagview(config, folder, on_progress=report)
             console.print(Markdown(report_markdown(metrics)))

@@ -19,11 +19,12 @@ def main(values: dict[str, Any], folder: Path) -> None:
     from rich.markdown import Markdown
 
     from tagjax.baselines.tagvision.experiment import TagVisionExperiment, report_markdown, run_tagvision
+    from tagjax.core.progress import progress_lines
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = checked(TagVisionExperiment, values, folder)
-    with console.status("TagVision") as status:
-        metrics = run_tagvision(config, folder, on_progress=status.update if progress else None)
+    with progress_lines(shown=progress, console=console) as report:
+        metrics = run_tagvision(config, folder, on_progress=report)
     console.print(Markdown(report_markdown(metrics)))
     console.print(f"plots, table.md and metrics.json in {folder}", soft_wrap=True, highlight=False)
     print_result(metrics)

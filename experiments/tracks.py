@@ -21,13 +21,15 @@ from .command import checked, command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.evaluation.tracks import TracksConfig, run_tracks
 
     if values.get("folder") is None:
         raise ValueError("found no folder; expected folder=<folder with kinect-rfid/ or xovis-uwb/>.")
-    config, console = checked(TracksConfig, values, folder), Console(markup=False)
-    with console.status("scoring", spinner="line") as status:
-        run_tracks(config, folder, on_done=status.update)
+    progress, console = values.pop("progress"), Console(markup=False)
+    config = checked(TracksConfig, values, folder)
+    with progress_lines(shown=progress, console=console) as report:
+        run_tracks(config, folder, on_progress=report)
     console.print((folder / "tables.md").read_text(), markup=False)
     console.print(f"run folder: {folder}")
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from .command import command
+from .command import resumable_command
 from .errors import errors_in_one_line
 from .hparams_search import sweep_score, trials_left
 from .run_folder import check_configuration, keep_configuration
@@ -23,7 +23,7 @@ from .suites import suite_recordings
 OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
 
 
-@command
+@resumable_command
 def main(values: dict[str, Any], folder: Path) -> float | None:
     from tagjax.core.settings import from_mapping
     from tagjax.training.config import TrainConfig
@@ -34,8 +34,9 @@ def main(values: dict[str, Any], folder: Path) -> float | None:
     data = values["data"]
     given = data["recordings"] or data["validation"] or data["virtual_tag"]["tracks"] is not None
     if suite is not None and not given:
-        data["recordings"] = suite_recordings(suite, "train", recordings_dir)
-        data["validation"] = suite_recordings(suite, "validation", recordings_dir)
+        progress = values["loop"]["progress"]
+        data["recordings"] = suite_recordings(suite, "train", recordings_dir, progress=progress)
+        data["validation"] = suite_recordings(suite, "validation", recordings_dir, progress=progress)
     config = from_mapping(TrainConfig, values)
     check_configuration(folder, values)
     with errors_in_one_line("train", DivergedError):

@@ -10,13 +10,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from .command import command
+from .command import resumable_command
 from .errors import errors_in_one_line
 from .hparams_search import sweep_score
 from .run_folder import check_configuration, keep_configuration
 
 
-@command
+@resumable_command
 def main(values: dict[str, Any], folder: Path) -> float | None:
     from tagjax.core.settings import from_mapping
     from tagjax.training.flow_config import TrainFlowConfig

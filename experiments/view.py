@@ -19,15 +19,13 @@ from .command import checked, command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.evaluation.view import ViewConfig, view_recording
-
-    from .progress import counting_bar
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = checked(ViewConfig, values, folder)
-    with counting_bar(console, shown=progress) as bar:
-        task = bar.add_task("trace", total=None)
-        out = view_recording(config, folder, on_frame=lambda done, total: bar.update(task, completed=done, total=total))
+    with progress_lines(shown=progress, console=console) as report:
+        out = view_recording(config, folder, on_progress=report)
     if out is not None:
         console.print(f"open it: rerun {out}", soft_wrap=True, highlight=False)
         print(out)

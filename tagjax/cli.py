@@ -23,7 +23,9 @@ def _command(name: str) -> Callable[[], None]:
 
 
 benchmark = _command("benchmark")
+calibrate_antenna = _command("calibrate_antenna")
 calibrate_camera = _command("calibrate_camera")
+check = _command("check")
 compare = _command("compare")
 error_budget = _command("error_budget")
 evaluate = _command("evaluate")
@@ -31,6 +33,8 @@ evaluate_flow = _command("evaluate_flow")
 fault_trial = _command("fault_trial")
 goller = _command("goller")
 import_recording = _command("import_recording")
+picture = _command("picture")
+paper = _command("paper")
 reads_ceiling = _command("reads_ceiling")
 record = _command("record")
 report = _command("report")

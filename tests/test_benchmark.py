@@ -19,13 +19,13 @@ from tagjax.core.settings import ConfigError, from_mapping
 
 
 def test_cases_give_times_of_both_and_their_ratio():
-    result: list[str] = []
+    result: list[tuple] = []
     settings = BenchmarkSettings(cases=("gather", "coherence"), height=48, width=64, repeats=2)
-    running = run_benchmark(settings, on_case=result.append)
+    running = run_benchmark(settings, on_progress=lambda *one: result.append(one))
     timings = [next(running)]
-    assert result == ["gather"]  # each figure comes when it is found
+    assert result == [("measure", 0, 2, "gather")]  # each figure comes when it is found
     timings += running
-    assert result == ["gather", "coherence"]
+    assert result[1:] == [("measure", 1, 2, "coherence"), ("measure", 2, 2)]
     for timing in timings:
         assert isinstance(timing, Timing)
         assert timing.ours_ms > 0

@@ -202,8 +202,12 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
         ["planar_tracks"], smoke=True, max_recordings=1, recordings_dir=str(tmp_path / "made"), only=("tagattention_published", "tagvision", "goller")
     )  # fmt: skip
     config = dataclasses.replace(config, scores=dataclasses.replace(config.scores, min_pixels=2))
-    reported: list[str] = []
-    cells = run_comparison(config, tmp_path / "out", on_progress=reported.append)
+    reported: list[tuple[str, int, int, str]] = []
+
+    def report(stage: str, done: int, total: int, now: str = "") -> None:
+        reported.append((stage, done, total, now))
+
+    cells = run_comparison(config, tmp_path / "out", on_progress=report)
     published, vision, goller = cells
     assert goller.reason == "location by proximity needs several antennas"
     assert (published.num_recordings, vision.num_recordings) == (2, 2)  # one of each variant
@@ -218,7 +222,8 @@ def test_systems_meet_on_a_suite_in_small(tmp_path: Path):
     assert [one["paper"] for one in written] == [None, config.published["planar_tracks"]["tagvision"], None]
     assert "several antennas" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "comparison.png").is_file()
-    assert any("simulated" in line for line in reported)
+    assert reported[0][:3] == ("simulate planar_tracks", 0, 2)
+    assert reported[-1][:3] == ("trace", 6, 6)
     assert (published.settings, vision.settings) == (None, None)  # one setting each
     assert (vision.error_mm is None) == (vision.identification == 0)  # the error is over correctly identified frames
 

@@ -6,6 +6,7 @@ import errno
 import os
 import pickle
 import re
+import shlex
 import shutil
 import signal
 import socket
@@ -118,7 +119,11 @@ def test_a_command_that_is_interrupted_during_its_imports_ends_in_one_line(
     process = _start([*COMMANDS["module"], *more, *folders], **_blocking_module(tmp_path, "optax"))
     error = _signal_when(process, (tmp_path / "importing").exists, number)
     assert process.returncode == STATUS[number]
-    assert error.strip() == f"train: {TEXT[number]}"
+    folder = f"hydra.{'sweep' if more else 'run'}.dir={tmp_path / ('sweep' if more else 'run')}"
+    assert error.strip().splitlines() == [
+        f"train: {TEXT[number]}",
+        f"resume with: {shlex.join(['python', '-m', 'experiments.train', *more, folder])}",
+    ]
     assert not (tmp_path / "sweep" / "1").exists()  # later jobs do not start
 
 
@@ -194,7 +199,9 @@ def test_an_interrupted_simulation_ends_with_its_workers(number: signal.Signals,
 
     error = _signal_when(process, writing, number)
     assert process.returncode == STATUS[number]
-    assert error.strip() == f"simulate: {TEXT[number]}"
+    first, second = error.strip().splitlines()
+    assert first == f"simulate: {TEXT[number]}"
+    assert second.startswith("resume with: python -m experiments.simulate ")
     assert len(workers) >= 2
     assert psutil.wait_procs(workers, timeout=20)[1] == []
     assert not list(tmp_path.glob("corpus/*/.*.partial"))
@@ -223,15 +230,19 @@ def test_training_that_was_stopped_raises_after_its_checkpoint(
 def test_a_run_that_sigterm_stopped_does_not_start_the_next_command_and_resumes(scene: str, tmp_path: Path) -> None:
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     _finish(_train(scene, straight))
+    resume: list[str] = []
     for step, number in ((5, signal.SIGTERM), (10, signal.SIGINT)):
         process = _start(_train(scene, broken))
         error = _signal_when(process, lambda step=step: step in _steps_logged(broken), number)
         assert process.returncode == STATUS[number]
-        assert error.strip().splitlines()[-1] == f"train: {TEXT[number]}"
+        first, second = error.strip().splitlines()[-2:]
+        assert first == f"train: {TEXT[number]}"
+        resume = shlex.split(second.removeprefix("resume with: "))
+        assert resume[:3] == ["python", "-m", "experiments.train"]
         stopped = max(int(path.name) for path in (broken / "checkpoints").iterdir())
         assert step <= stopped < NUM_STEPS
         assert stopped == _steps_logged(broken)[-1]
-    _finish(_train(scene, broken))
+    _finish([sys.executable, *resume[1:]])  # as it is printed
     _same(straight, broken)
 
 
@@ -247,7 +258,7 @@ def test_training_that_is_interrupted_while_its_workers_import_ends_in_one_line(
 
     error = _signal_when(process, started, number)
     assert process.returncode == STATUS[number]
-    assert error.strip().splitlines()[-1] == f"train: {TEXT[number]}"
+    assert error.strip().splitlines()[-2] == f"train: {TEXT[number]}"
     assert "Traceback" not in error
 
 

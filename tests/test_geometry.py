@@ -64,6 +64,28 @@ def test_registration_turns_with_the_rotation():
     np.testing.assert_allclose(moved[y, x], 2.0 / (normal @ ray), atol=0.02)
 
 
+@pytest.mark.parametrize(
+    "more", [(), (0.1, -0.08, 0.02), (0.1, -0.08, 0.02, 0.004, -0.003, 0.002, 0.001)], ids=["5", "8", "12"]
+)
+def test_positions_in_the_distorted_picture_are_those_of_opencv(more):
+    camera = dataclasses.replace(CAMERA, distortion=(0.12, -0.2, 0.003, -0.002, 0.05, *more))
+    maps = cv2.initUndistortRectifyMap(
+        camera.matrix(), np.array(camera.distortion), np.eye(3), camera.matrix(), (64, 48), cv2.CV_32FC1
+    )
+    np.testing.assert_allclose(undistorted_positions(camera), np.stack(maps, axis=-1), atol=1e-3)
+    if more:
+        plain = undistorted_positions(dataclasses.replace(camera, distortion=camera.distortion[:5]))
+        assert np.abs(plain - undistorted_positions(camera)).max() > 0.3
+
+
+def test_a_tilted_sensor_is_refused():
+    tilted = dataclasses.replace(CAMERA, distortion=(0.1,) + (0.0,) * 11 + (0.05, 0.0))
+    with pytest.raises(ValueError, match="tilted sensor"):
+        undistorted_positions(tilted)
+    flat = dataclasses.replace(CAMERA, distortion=(0.1,) + (0.0,) * 13)
+    assert np.isfinite(undistorted_positions(flat)).all()
+
+
 def test_undistortion_agrees_with_opencv():
     camera = dataclasses.replace(CAMERA, distortion=(0.12, -0.2, 0.003, -0.002, 0.05))
     maps = cv2.initUndistortRectifyMap(

@@ -110,7 +110,7 @@ def test_the_mask_and_the_refined_likelihood_are_those_of_the_twin(seed: int) ->
     likelihood = np.where(np.isin(cluster, [3, 4]).reshape(HEIGHT, WIDTH), -1.0, -9.0)
     likelihood = (likelihood + rng.normal(0, 1, likelihood.shape)).astype(np.float32)
     tracer = TagAttentionPublished()
-    carried, mask = tracer._masked(jnp.asarray(likelihood), jnp.asarray(valid), jnp.asarray(cluster))
+    *_, carried, mask = tracer._masked(jnp.asarray(likelihood), jnp.asarray(valid), jnp.asarray(cluster))
     want, want_mask = plain.masked(likelihood, valid, cluster, cut=0.1, lowest=1e-3, whole=0.3, part=0.1)
     np.testing.assert_array_equal(np.asarray(mask) > 0.5, want_mask)
     assert want_mask.any()
@@ -121,7 +121,7 @@ def test_where_nothing_stands_out_there_is_no_mask() -> None:
     tracer, valid = TagAttentionPublished(), jnp.ones((HEIGHT, WIDTH), bool)
     cluster = jnp.zeros(HEIGHT * WIDTH, jnp.int32)
     for constant, known in ((0.0, valid), (-3.0, valid), (0.0, ~valid)):
-        likelihood, mask = tracer._masked(jnp.full(valid.shape, constant), known, cluster)
+        *_, likelihood, mask = tracer._masked(jnp.full(valid.shape, constant), known, cluster)
         assert not np.asarray(mask).any()
         assert np.isfinite(np.asarray(likelihood)).all()
 

@@ -102,9 +102,10 @@ def _config(folder: Path, **changed) -> StreamConfig:
 
 def test_a_stream_writes_a_line_a_frame_and_a_summary(tmp_path):
     seen = []
-    summary = run_stream(_config(tmp_path), tmp_path / "run", on_frame=seen.append)
+    summary = run_stream(_config(tmp_path), tmp_path / "run", on_progress=lambda *one: seen.append(one))
     lines = [json.loads(line) for line in (tmp_path / "run/frames.jsonl").read_text().splitlines()]
-    assert len(lines) == len(seen) == summary["frames"] == 24
+    assert len(lines) == summary["frames"] == 24
+    assert [one[:3] for one in seen] == [("stream", done, 24) for done in range(25)]
     assert summary["dropped_frames"] == 0
     assert summary["unused_reads"] == 1  # at the time of the first frame, which has none
     assert summary["camera_moved"] is False
@@ -127,11 +128,11 @@ def test_a_stream_writes_a_line_a_frame_and_a_summary(tmp_path):
 
 
 def test_ctrl_c_keeps_what_was_traced(tmp_path):
-    def interrupt(text: str) -> None:
-        if text.startswith("frame 5:"):
+    def interrupt(stage: str, done: int, total: int, now: str = "") -> None:
+        if done == 5:
             raise KeyboardInterrupt
 
-    summary = run_stream(_config(tmp_path), tmp_path / "run", on_frame=interrupt)
+    summary = run_stream(_config(tmp_path), tmp_path / "run", on_progress=interrupt)
     assert summary["interrupted"]
     assert summary["frames"] == 5
     assert len((tmp_path / "run/frames.jsonl").read_text().splitlines()) == 5

@@ -369,7 +369,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     monkeypatch.setattr(
         measuring,
         "make_items",
-        lambda suite, folder, *, splits, workers, on_done: [item for item in suite.items() if item.split in splits],
+        lambda suite, folder, *, splits, workers, on_progress: [item for item in suite.items() if item.split in splits],
     )
     return found
 
@@ -547,8 +547,8 @@ def test_a_table_is_made_with_all_that_its_values_can_be_computed_from(root: Pat
     assert table["command"] == "python -m experiments.reproduce table=small"
     assert rendered(table) in (root / "page.md").read_text()
     assert status(recipe, root) == []
-    assert steps[-1] == ("measured", 4, 4)
-    assert [done for what, done, _ in steps if what.endswith(": online")] == [0, 1, 2, 3]
+    assert steps[-1] == ("trace", 4, 4)
+    assert [done for _, done, _, now in steps[:-1] if now.endswith(": online")] == [0, 1, 2, 3]
 
 
 @pytest.mark.ci

@@ -282,10 +282,12 @@ def test_a_grid_is_swept_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyP
     asked: list[str] = []
     evaluate = sweep.evaluate_recording
     monkeypatch.setattr(sweep, "evaluate_recording", lambda *a, **k: asked.append("") or evaluate(*a, **k))
-    again = run_sweep(config, tmp_path / "sweep", on_progress=lambda done, total, name: found.append(f"{done}/{total}"))
+    again = run_sweep(
+        config, tmp_path / "sweep", on_progress=lambda stage, done, total, now="": found.append(f"{done}/{total} {now}")
+    )
     assert again == lines
     assert len(asked) == 1
-    assert found[-1] == "3/4"
+    assert [one.split()[0] for one in found] == ["2/4", "3/4", "4/4"]
     for name in ("table.md", "table.csv", "sweep.png"):
         assert (tmp_path / "sweep" / name).stat().st_size > 50
 

@@ -178,8 +178,10 @@ def test_training_lowers_the_loss_and_weights_are_read_back(tmp_path):
     settings = TrainSettings(
         num_steps=60, batch_size=4, crop_px=(32, 48), widths=(4, 8, 8), depth=1, learning_rate=0.01
     )
-    losses = []
-    network, recipe = train_detector(_pictures(20), settings, on_step=lambda _, loss: losses.append(loss))
+    seen = []
+    network, recipe = train_detector(_pictures(20), settings, on_progress=lambda *one: seen.append(one))
+    assert [one[:3] for one in seen] == [("train", step, 60) for step in range(61)]
+    losses = [float(one[3].removeprefix("loss ")) for one in seen[1:]]
     assert recipe["steps_done"] == 60
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])
     about = {"network": {"widths": [4, 8, 8], "depth": 1}, "recipe": recipe}

@@ -190,7 +190,7 @@ def test_every_method_finds_the_carrier_on_clean_walks(folder, tmp_path):
         flip_probability=0.0,
         region="fixed",
     )
-    rows = run_tracks(config, tmp_path, on_done=lambda name: None)["rows"]
+    rows = run_tracks(config, tmp_path)["rows"]
     assert [row["scene"] for row in rows] == ["kinect-rfid", "xovis-uwb"]
     for row in rows:
         assert set(row["accuracy"]) == set(METHODS)

@@ -49,10 +49,10 @@ def test_the_file_holds_reads_pictures_and_what_was_traced(path: Path, tmp_path:
     pytest.importorskip("rerun")
     done = []
     config = ViewConfig(recording=str(path), tracer=TRACER, clips=CLIPS)
-    out = view_recording(config, tmp_path, on_frame=lambda number, total: done.append((number, total)))
+    out = view_recording(config, tmp_path, on_progress=lambda *one: done.append(one))
     assert out == tmp_path / f"{scene(40).name}.rrd"
     assert out.stat().st_size < 5e6
-    assert done[-1] == (40, 40)
+    assert done == [("trace", 0, 40, "compiling"), *(("trace", number, 40) for number in range(1, 41))]
     traces = list(trace_recording(make_tracer(TRACER), scene(40), clip_loader(ClipSettings(**CLIPS)), epcs=list(EPCS)))
     for tag, epc in enumerate(EPCS):
         reads = scene(40).reads.select(epc)

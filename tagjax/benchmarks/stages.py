@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..core.progress import OnProgress, unobserved
 from ..flow.registry import make_flow
 from ..image.warp import gather, splat
 from ..radio.coherence import coherence
@@ -234,12 +235,10 @@ CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | Iterable[Timing | Fig
 """The cases that can be measured, by name."""
 
 
-def run_benchmark(
-    settings: BenchmarkSettings, *, on_case: Callable[[str], None] | None = None
-) -> Iterator[Timing | Figure]:
-    """Measure the cases one after the other and yield each timing; `on_case` is called with the name of each case before it."""
-    for name in settings.cases:
-        if on_case is not None:
-            on_case(name)
+def run_benchmark(settings: BenchmarkSettings, *, on_progress: OnProgress = unobserved) -> Iterator[Timing | Figure]:
+    """Measure the cases one after the other and yield each timing; `on_progress` counts the cases."""
+    for number, name in enumerate(settings.cases):
+        on_progress("measure", number, len(settings.cases), name)
         timings = CASES[name](settings)
         yield from (timings,) if isinstance(timings, Timing) else timings
+    on_progress("measure", len(settings.cases), len(settings.cases))

@@ -17,9 +17,9 @@ from typing import Any, cast
 import filelock
 import numpy as np
 import zarr
-from rich.progress import Progress
 
 from .files import make_folder, write_atomic, writing
+from .progress import progress_lines
 from .types import LazyArray
 
 _ARRAY, _NUM_ROWS = "array", "num_rows"
@@ -90,8 +90,9 @@ def write_rows(
             attributes=dict(attributes),
         )
     pending: list[np.ndarray] = []
-    with Progress(disable=not progress, transient=True) as bar:
-        task = bar.add_task(description, total=shape[0], completed=num_rows)
+    with progress_lines(shown=progress, kept=False) as report:
+        done = num_rows
+        report(description, done, shape[0])
         for block in rows(num_rows):
             pending.append(block)
             count = sum(map(len, pending))
@@ -99,7 +100,8 @@ def write_rows(
                 array[num_rows : num_rows + count] = np.concatenate(pending)
                 num_rows, pending = num_rows + count, []
                 write_atomic(path.with_name(_NUM_ROWS), str(num_rows))
-            bar.advance(task, len(block))
+            done += len(block)
+            report(description, done, shape[0])
     if num_rows != shape[0] or pending:
         raise ValueError(f"{num_rows + sum(map(len, pending))} rows for an array of {shape[0]}.")
 

@@ -72,28 +72,38 @@ def register_depth(
 
 
 def _fill_pinholes(depth_m: np.ndarray) -> np.ndarray:
-    padded = np.pad(depth_m, 1)
-    height, width = depth_m.shape
-    near = np.stack([padded[dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)])
-    known = near > 0
-    hole = (depth_m == 0) & (known.sum(axis=0) >= 5)
-    if not hole.any():
+    known = np.pad((depth_m > 0).view(np.uint8), 1)
+    along = known[:-2] + known[1:-1] + known[2:]
+    count = along[:, :-2] + along[:, 1:-1] + along[:, 2:]
+    row, column = np.nonzero((depth_m == 0) & (count >= 5))
+    if not len(row):
         return depth_m
-    values = np.where(known, near, np.nan)[:, hole]
+    padded = np.pad(depth_m, 1)
+    near = np.stack([padded[row + dy, column + dx] for dy in range(3) for dx in range(3)])
     out = depth_m.copy()
-    out[hole] = np.nanmedian(values, axis=0)
+    out[row, column] = np.nanmedian(np.where(near > 0, near, np.nan), axis=0)
     return out
 
 
 def undistorted_positions(intrinsics: Intrinsics) -> Float[np.ndarray, "height width 2"]:
-    """Position (x, y) in the distorted image of each pixel of the pinhole image, pixels (Brown-Conrady k1 k2 p1 p2 k3)."""
-    k1, k2, p1, p2, k3 = (*intrinsics.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    """Position (x, y) in the distorted image of each pixel of the pinhole image, pixels.
+
+    OpenCV's model: Brown-Conrady k1 k2 p1 p2 k3, the rational model's k4 k5 k6, the thin prism's s1 s2 s3 s4. Raises
+    `ValueError` for a tilted sensor (coefficients 13 and 14 that are not 0).
+    """
+    given = intrinsics.distortion
+    if any(given[12:]):
+        raise ValueError(
+            f"distortion has the coefficients {given[12:]} of a tilted sensor; expected at most the 12 of the rational and thin "
+            "prism models. Calibrate without CALIB_TILTED_MODEL."
+        )
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (*given, *(0.0,) * 12)[:12]
     rays = pixel_rays(intrinsics).astype(np.float64)
     x, y = rays[..., 0], rays[..., 1]
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4)
     return np.stack([xd * intrinsics.fx_px + intrinsics.cx_px, yd * intrinsics.fy_px + intrinsics.cy_px], axis=-1)
 
 

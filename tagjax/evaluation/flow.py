@@ -11,12 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 from rich.box import SIMPLE
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from ..core.files import write_atomic
 from ..core.machine import machine
 from ..core.names import safe_file_name
+from ..core.progress import progress_lines
 from ..core.results import write_json
 from ..flow.opencv import FlowFunction
 from ..flow.registry import flow_key, make_flow, split_suffixes
@@ -109,10 +109,8 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
         "machine": machine(),
         "materials": {},
     }
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, disable=not settings.progress, transient=True) as bar:
+    with progress_lines(shown=settings.progress) as report:
         for material in materials:
-            task = bar.add_task(material.name, total=material.num_cases)
             scored = _Scored(flows, settings)
             panel_numbers = set(
                 np.linspace(0, material.num_cases - 1, settings.num_panels).round().astype(int).tolist()
@@ -120,9 +118,9 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
             done = 0
             try:
                 for number, case in enumerate(material.cases()):
+                    report(material.name, done, material.num_cases)
                     scored.add(case, folder / "panels" if number in panel_numbers else None)
                     done += 1
-                    bar.advance(task)
             except BaseException as error:
                 if done:
                     summary["materials"][material.name] = scored.result()
@@ -132,6 +130,7 @@ def evaluate_flows(settings: FlowEvaluationSettings, folder: Path) -> dict[str, 
                     _write(summary, folder, "unfinished.json", "unfinished.md")
                     error.add_note(f"The scores of the finished cases are in {folder / 'unfinished.md'}.")
                 raise
+            report(material.name, done, material.num_cases)
             summary["materials"][material.name] = scored.result()
     _write(summary, folder, "metrics.json", "flow.md")
     for name in ("unfinished.json", "unfinished.md"):  # from an earlier call

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..core.progress import progress_lines
 from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
@@ -91,7 +92,8 @@ def run_evaluation(
         frames=config.frames,
         progress=config.progress,
     )
-    write_page(folder)
+    with progress_lines(shown=config.progress) as report:
+        write_page(folder, on_progress=report)
     return summary
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError, from_mapping
 from ..recording import Recording
 from ..recording.store import open_recording
@@ -39,7 +40,11 @@ class SuiteSelection:
         if self.workers < 1:
             raise ConfigError(f"workers is {self.workers}; expected at least 1 process.")
 
-    def items(self, name: str, report: Callable[[str], None] = lambda _: None) -> list[Item]:
+    def all_items(self, report: OnProgress = unobserved) -> dict[str, list[Item]]:
+        """The items of every suite by its name: see `items`."""
+        return {name: self.items(name, report) for name in self.suites}
+
+    def items(self, name: str, report: OnProgress = unobserved) -> list[Item]:
         """A suite's items, simulated where they are missing. Raises `ConfigError` where it has none, or no pictures."""
         suite = from_mapping(Suite, self.suites[name], where=f"suite {name}")
         suite = suite.smoke() if self.smoke else suite
@@ -51,14 +56,12 @@ class SuiteSelection:
             splits=(self.split,),
             max_per_variant=self.max_recordings,
             workers=self.workers,
-            on_done=lambda one: report(f"simulated {one.name}"),
+            on_progress=report,
         )
         if not items:
             raise ConfigError(f"{suite.name} has no {self.split} recording; choose another split, or raise its counts.")
         return items
 
-    def recordings(self, name: str, report: Callable[[str], None] = lambda _: None) -> Iterator[tuple[Item, Recording]]:
-        """A suite's items with their recordings, opened one after the other."""
-        for item in self.items(name, report):
-            report(item.name)
-            yield item, open_recording(item.path(Path(self.recordings_dir)))
+    def open(self, item: Item) -> Recording:
+        """The recording of an item."""
+        return open_recording(item.path(Path(self.recordings_dir)))

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..core.camera import working_stride
 from ..core.files import write_atomic, writing
+from ..core.progress import OnProgress, unobserved
 from ..core.results import markdown_table, to_json_values, write_csv
 from ..core.settings import ConfigError, changed, from_mapping
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
@@ -93,15 +94,11 @@ class Line:
     iou: tuple[float | None, ...]  # by frame, mean over visible tags; no detection counts as 0
 
 
-def run_sweep(
-    config: SweepConfig, folder: Path, *, on_progress: Callable[[int, int, str], None] | None = None
-) -> list[Line]:
+def run_sweep(config: SweepConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> list[Line]:
     """The lines of all recordings at all points; `folder` then holds them, table.md, table.csv and sweep.png.
 
-    Lines that the folder holds already are not computed again. `on_progress` gets the number of finished lines, the number of all, and the
-    name of the next one.
+    Lines that the folder holds already are not computed again. `on_progress` counts the lines.
     """
-    report = on_progress or (lambda done, total, name: None)
     folder.mkdir(parents=True, exist_ok=True)
     points, clips = config.points(), config.clip_settings()
     tracers = [
@@ -111,7 +108,7 @@ def run_sweep(
         (suite, item)
         for name, values in config.suites.items()
         for suite in [_suite(config, from_mapping(Suite, values, where=f"suite {name}"))]
-        for item in _items(config, suite, lambda made: report(0, 0, f"simulated {made}"))
+        for item in _items(config, suite, on_progress)
     ]
     known = {line.key: line for line in read_lines(folder / _LINES)}
     lines: list[Line] = []
@@ -123,7 +120,7 @@ def run_sweep(
         recording = open_recording(item.path(Path(config.recordings_dir)))
         load = _caching_loader(clips)
         for key, point, tracer in zip(keys, points, tracers, strict=True):
-            report(len(lines), len(work) * len(points), f"{item.name} {point_name(point)}")
+            on_progress("trace", len(lines), len(work) * len(points), f"{item.name} {point_name(point)}")
             if key not in known:
                 settings = dataclasses.replace(config.scores, num_pictures=1)
                 result = evaluate_recording(
@@ -132,6 +129,7 @@ def run_sweep(
                 known[key] = Line(key, _condition(item), item.name, point, result.scores().result(), frame_iou(result))
                 _append(folder / _LINES, known[key])
             lines.append(known[key])
+    on_progress("trace", len(lines), len(lines))
     write_sweep(folder, config, lines)
     return lines
 
@@ -143,14 +141,14 @@ def _suite(config: SweepConfig, suite: Suite) -> Suite:
     return dataclasses.replace(suite, capture=dataclasses.replace(suite.capture, width=config.width))
 
 
-def _items(config: SweepConfig, suite: Suite, report: Callable[[str], None]) -> list[Item]:
+def _items(config: SweepConfig, suite: Suite, report: OnProgress) -> list[Item]:
     items = make_items(
         suite,
         Path(config.recordings_dir),
         splits=config.splits,
         max_per_variant=config.max_recordings,
         workers=config.workers,
-        on_done=lambda made: report(made.name),
+        on_progress=report,
     )
     if not items:
         raise ConfigError(f"{suite.name} has no recording of {', '.join(config.splits)}; choose other splits.")

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import zarr
-from rich.markup import escape
-from rich.progress import track
 from zarr.storage import LocalStore
 
 from ..core.array_cache import compute_once
 from ..core.files import WriteError
+from ..core.progress import tracked
 from ..recording import Recording, RecordingError
 from ..recording.stored_frames import StoredFrames, create_array
 from .opencv import FlowFunction
@@ -189,9 +188,7 @@ def _compute(recording: Recording, path: Path, key: str, flow: FlowFunction) -> 
     group = zarr.open_group(str(path), mode="w", zarr_format=3)
     targets = [create_array(group, direction, shape, np.float16, per_frame=True) for direction in _DIRECTIONS]
     pairs = _pairs(recording, 0, shape[0], flow)
-    for t, pair in enumerate(
-        track(pairs, description=escape(f"{recording.name}: {key} flow"), total=shape[0], transient=True)
-    ):
+    for t, pair in enumerate(tracked(pairs, f"{recording.name}: {key} flow", shape[0])):
         for target, flow_px in zip(targets, pair, strict=True):
             target[t] = flow_px.astype(np.float16)
     group.attrs.update(_attributes(recording, key))

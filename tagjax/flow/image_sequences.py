@@ -13,9 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 import zarr
-from rich.progress import Progress, track
 
 from ..core.array_cache import cached_array
+from ..core.progress import progress_lines, tracked
 from ..core.types import LazyArray
 from ..recording import RecordingError
 from ..recording.image_files import natural_sorted, read_colour
@@ -70,7 +70,7 @@ def _common_shape(folder: Path, files: Sequence[Path]) -> tuple[int, ...]:
         read = pool.map(_shape_or_error, files)
         for path, found in zip(
             files,
-            track(read, f"check {folder.name}", len(files), disable=len(files) < _PROGRESS_FROM, transient=True),
+            tracked(read, f"check {folder.name}", len(files), shown=len(files) >= _PROGRESS_FROM),
             strict=True,
         ):
             (bad if isinstance(found, RecordingError) else shapes)[path] = found
@@ -145,12 +145,12 @@ def _decode(video: Path, path: Path) -> None:
         stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         shape = (0, size[1], size[0], 3)
         array = zarr.create_array(str(path), shape=shape, dtype="uint8", chunks=(1, *shape[1:]))
-        with Progress(transient=True) as bar:
-            task = bar.add_task(f"decode {video.name}", total=stated if 0 < stated < math.inf else None)
+        total = round(stated) if 0 < stated < math.inf else 0
+        with progress_lines(kept=False) as report:
             while ok:
+                report(f"decode {video.name}", array.shape[0], total)
                 small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)[..., ::-1]
                 array.append(np.ascontiguousarray(small)[None])
-                bar.advance(task)
                 ok, image = capture.read()
         if array.shape[0] < 2:
             raise RecordingError(

@@ -88,6 +88,7 @@ class Source:
     depth_kind: str
     antennas_m: np.ndarray  # (num_antennas, 3)
     antennas: tuple[int, ...]  # whose reads are used, counted from 1
+    num_frames: int  # that it will give; 0: it does not end by itself
     start: Callable[[], Replay | SensorStream]
 
 
@@ -103,8 +104,15 @@ def open_source(config: StreamConfig, stack: contextlib.ExitStack) -> Source:
         def start() -> Replay:
             return stack.enter_context(contextlib.closing(Replay(recording, config.replay)))
 
-        antennas = _antennas(config, recording)
-        return Source(recording.name, recording.intrinsics, recording.depth_kind, recording.antennas_m, antennas, start)
+        return Source(
+            recording.name,
+            recording.intrinsics,
+            recording.depth_kind,
+            recording.antennas_m,
+            _antennas(config, recording),
+            recording.num_frames * config.replay.loops,
+            start,
+        )
     stream = SensorStream(sensors, record=config.record, reads_wait_s=config.reads_wait_s)
     stack.callback(stream.close)
     video = stream.open()
@@ -113,8 +121,12 @@ def open_source(config: StreamConfig, stack: contextlib.ExitStack) -> Source:
         stream.start()
         return stream
 
-    antennas = _antennas(config, None if config.address is not None else stream.sensors.played)
-    return Source(stream.name, video.intrinsics, video.depth_kind, stream.sensors.antennas_m, antennas, begin)
+    played = stream.sensors.played
+    antennas = _antennas(config, None if config.address is not None else played)
+    num_frames = played.num_frames if played is not None and config.camera == "playback" else 0
+    return Source(
+        stream.name, video.intrinsics, video.depth_kind, stream.sensors.antennas_m, antennas, num_frames, begin
+    )
 
 
 def _antennas(config: StreamConfig, played: Recording | None) -> tuple[int, ...]:

@@ -15,6 +15,7 @@ import jax
 
 from ..core.camera import working_stride
 from ..core.machine import peak_memory_mib
+from ..core.progress import OnProgress, unobserved
 from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..flow.registry import make_flow
@@ -28,12 +29,14 @@ from .page import LivePage
 from .results import Totals, sightings
 from .sensors import SensorStream
 
+_STAGE = "stream"
+
 
 def run_stream(
     config: StreamConfig,
     folder: Path,
     *,
-    on_frame: Callable[[str], None] | None = None,
+    on_progress: OnProgress = unobserved,
     on_page: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Trace a recording or running sensors; the summary, which is also written to stream.json.
@@ -54,6 +57,7 @@ def run_stream(
         own = tracer_clips(config.tracer).stride if config.stride is None else config.stride
         stride = working_stride(source.intrinsics.width, own)
         live = _live_tracer(config, tracer, source, stride)
+        on_progress(_STAGE, 0, source.num_frames, "compiling")
         start_s = live.warm_up()
         lines = stack.enter_context((folder / "frames.jsonl").open("w"))
         events = EventLog(config.events, stack.enter_context((folder / "events.jsonl").open("w")))
@@ -62,7 +66,7 @@ def run_stream(
         feed = _feed(config, stack, source.name, live, stride, frames, events, on_page)
         shape = source.intrinsics.height, source.intrinsics.width
         following = _Following(live, stride, shape, totals, lines, events, feed)
-        interrupted = _followed(following, frames, on_frame)
+        interrupted = _followed(following, frames, source.num_frames, on_progress)
         lasted_s = time.monotonic() - begun
     summary = {
         **totals.summary(),
@@ -142,16 +146,15 @@ class _Following:
         if self.feed is not None:
             self.feed.add(frame, found, tags, events, self.totals)
         states = ", ".join(f"{epc} {tag.status}" for epc, tag in tags.items()) or "no tag"
-        return f"frame {self.totals.num_frames}: {self.totals.computing.percentile(50):.0f} ms; {states}"
+        return f"{self.totals.computing.percentile(50):.0f} ms; {states}"
 
 
-def _followed(following: _Following, frames: Replay | SensorStream, on_frame: Callable[[str], None] | None) -> bool:
+def _followed(following: _Following, frames: Replay | SensorStream, num_frames: int, on_progress: OnProgress) -> bool:
     """Follow all frames; whether Ctrl-C ended it."""
     try:
         for frame in frames:
             text = following(frame)
-            if on_frame is not None:
-                on_frame(text)
+            on_progress(_STAGE, following.totals.num_frames + frames.num_dropped, num_frames, text)
     except KeyboardInterrupt:
         return True
     return False

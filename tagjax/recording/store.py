@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import zarr
-from rich.markup import escape
-from rich.progress import Progress
 
 from ..core.camera import Intrinsics
 from ..core.errors import RecordingError
 from ..core.files import atomic_path
+from ..core.progress import tracked
 from ..core.types import LazyArray
 from .reads import TagReads
 from .recording import ClockAudit, ClockPiece, Recording, Truth
@@ -63,11 +62,23 @@ def write_recording(recording: Recording, root: zarr.Group, *, progress: bool = 
     Raises `RecordingError` for values that cannot be stored, before any frame is written.
     """
     frames, arrays, attributes = _parts(recording)
-    with Progress(disable=not progress, transient=True) as bar:
-        for name, source in frames.items():
-            target = create_array(root, name, tuple(source.shape), source.dtype, per_frame=True)
-            for t in bar.track(range(source.shape[0]), description=escape(f"{recording.name}: {name}")):
-                target[t] = np.asarray(source[t])
+    for name, source in frames.items():
+        target = create_array(root, name, tuple(source.shape), source.dtype, per_frame=True)
+        for t in tracked(range(source.shape[0]), f"{recording.name}: {name}", shown=progress):
+            target[t] = np.asarray(source[t])
+    _write_rest(root, arrays, attributes)
+
+
+def write_all_but_frames(recording: Recording, root: zarr.Group) -> None:
+    """Write the rest of a recording into a Zarr group that holds its frames already; its attributes are written last.
+
+    Raises `RecordingError` for values that cannot be stored.
+    """
+    _, arrays, attributes = _parts(recording)
+    _write_rest(root, arrays, attributes)
+
+
+def _write_rest(root: zarr.Group, arrays: Mapping[str, np.ndarray], attributes: dict[str, Any]) -> None:
     for name, values in arrays.items():
         target = create_array(root, name, values.shape, values.dtype, per_frame=False)
         if values.size:

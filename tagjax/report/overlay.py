@@ -93,13 +93,6 @@ def draw_overlay(
 
 def picture_overlay(recording: Recording, picture: Picture) -> UInt8[np.ndarray, "picture_height picture_width 3"]:
     """The overlay of a tracer's output at one frame of a recording, with the true boxes where they are known."""
-    truth = recording.truth
-    true_boxes = np.full((len(picture.epcs), 4), np.nan)
-    if truth is not None and truth.labels is not None:
-        labels = np.asarray(truth.labels[picture.frame])
-        for tag, epc in enumerate(picture.epcs):
-            if epc in truth.tag_to_label:
-                true_boxes[tag] = label_box(labels, truth.tag_to_label[epc])
     return draw_overlay(
         np.asarray(recording.colour[picture.frame]),
         [short_name(epc) for epc in picture.epcs],
@@ -108,9 +101,21 @@ def picture_overlay(recording: Recording, picture: Picture) -> UInt8[np.ndarray,
         picture.confidence,
         picture.detected,
         status=picture.status,
-        true_boxes_px=true_boxes,
+        true_boxes_px=true_boxes(recording, picture.frame, picture.epcs),
         caption=f"frame {picture.frame}",
     )
+
+
+def true_boxes(recording: Recording, frame: int, epcs: Sequence[str]) -> Float[np.ndarray, "tag 4"]:
+    """The true boxes of tags' objects at one frame; NaN where they are not known, or nothing is visible."""
+    truth = recording.truth
+    boxes = np.full((len(epcs), 4), np.nan)
+    if truth is not None and truth.labels is not None:
+        labels = np.asarray(truth.labels[frame])
+        for tag, epc in enumerate(epcs):
+            if epc in truth.tag_to_label:
+                boxes[tag] = label_box(labels, truth.tag_to_label[epc])
+    return boxes
 
 
 def _missing(names: Sequence[str], status: Int8[np.ndarray, " tag"] | None) -> list[tuple[int, str]]:

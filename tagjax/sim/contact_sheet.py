@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from ..core.progress import OnProgress, unobserved
 from ..recording import Recording, RecordingError
 from ..recording.image_files import write_image
 from ..recording.store import open_recording
@@ -99,13 +100,15 @@ def save_sheet(suite: Suite, folder: Path) -> Path:
     return path
 
 
-def save_preview(suite: Suite, folder: Path, *, workers: int = 1, width: int = 960) -> Path:
+def save_preview(
+    suite: Suite, folder: Path, *, workers: int = 1, width: int = 960, on_progress: OnProgress = unobserved
+) -> Path:
     """Write a suite's contact sheet as <folder>/<name>.jpg, at most `width` pixels wide, without its recordings.
 
     Six frames of the first recording of every variant are simulated for it and not kept.
     """
     with tempfile.TemporaryDirectory() as scratch:
-        make_suite(suite.preview(), Path(scratch), workers=workers)
+        make_suite(suite.preview(), Path(scratch), workers=workers, on_progress=on_progress)
         sheet = cv2.imread(str(save_sheet(suite.preview(), Path(scratch))))
     assert sheet is not None
     shrink = min(1.0, width / sheet.shape[1])

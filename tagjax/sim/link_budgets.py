@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..core.progress import OnProgress, unobserved
 from ..radio.reader import HOP_TABLES_HZ
 from .propagation import propagation
 from .radio.budget import LinkBudget, link_budget
@@ -76,8 +77,11 @@ def tag_budgets(scenario: Scenario) -> list[TagBudget]:
     return found
 
 
-def budget_lines(suite: Suite, split: str) -> list[str]:
-    """A table of the budgets of all tags in a split of a suite, one line a tag, and the means by object."""
+def budget_lines(suite: Suite, split: str, *, on_progress: OnProgress = unobserved) -> list[str]:
+    """A table of the budgets of all tags in a split of a suite, one line a tag, and the means by object.
+
+    `on_progress` counts the recordings.
+    """
     items = [item for item in suite.items() if item.split == split]
     if suite.story == PLANAR or not items:
         raise ValueError(
@@ -85,8 +89,10 @@ def budget_lines(suite: Suite, split: str) -> list[str]:
             "recording there."
         )
     rows: list[tuple[str, TagBudget]] = []
-    for item in items:
+    for number, item in enumerate(items):
+        on_progress("link budgets", number, len(items), item.name)
         rows += [(_short(item), budget) for budget in tag_budgets(item_scenario(item))]
+    on_progress("link budgets", len(items), len(items))
     lines = [_row(_COLUMNS), *(_line(name, budget.object_name, [budget]) for name, budget in rows)]
     for kind in sorted({budget.object_name for _, budget in rows}):
         lines.append(_line("mean", kind, [budget for _, budget in rows if budget.object_name == kind]))

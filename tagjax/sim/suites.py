@@ -19,6 +19,7 @@ from filelock import FileLock
 
 from ..core.files import atomic_path, make_folder, write_atomic, writing
 from ..core.json_text import parse_json
+from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError
 from ..core.worker_process import end_with_parent, signals_blocked, unblock_sigterm
 from ..recording import RecordingError
@@ -242,22 +243,34 @@ def make_suite(
     folder: Path,
     *,
     workers: int = 1,
-    on_done: Callable[[Made], None] | None = None,
+    on_progress: OnProgress = unobserved,
     wanted: Callable[[Item], bool] = lambda item: True,
 ) -> list[Made]:
     """Simulate the missing recordings of a suite that are `wanted`. Finished recordings are kept if a later one fails.
 
     Each recording is determined by its seed alone, so the number of workers changes nothing in it. Several processes may
-    call this at once: one simulates, the others wait and find the recordings there.
+    call this at once: one simulates, the others wait and find the recordings there. `on_progress` counts the recordings
+    that are there; it is not called where none is missing.
     """
     make_folder(folder)
     with writing(folder / suite.name), FileLock(folder / f".{suite.name}.lock"):
         missing = [item for item in prepare(suite, folder) if wanted(item)]
         try:
-            return _make_items(missing, folder, workers, on_done or (lambda made: None))
+            return _make_items(missing, folder, workers, _counting(suite, missing, wanted, on_progress))
         except BaseException:  # a worker that was ended while it wrote may leave a part
             _remove_partial(folder / suite.name)
             raise
+
+
+def _counting(
+    suite: Suite, missing: Sequence[Item], wanted: Callable[[Item], bool], report: OnProgress
+) -> Callable[[Made], None]:
+    """Reports the number of recordings that are there: now, if some are missing, and after each call."""
+    total = sum(map(wanted, suite.items()))
+    numbers, stage = itertools.count(total - len(missing)), f"simulate {suite.name}"
+    if missing:
+        report(stage, next(numbers), total)
+    return lambda made: report(stage, next(numbers), total, made.name)
 
 
 def _make_items(items: Sequence[Item], folder: Path, workers: int, on_done: Callable[[Made], None]) -> list[Made]:
@@ -310,14 +323,14 @@ def make_items(
     splits: Sequence[str],
     max_per_variant: int | None = None,
     workers: int = 1,
-    on_done: Callable[[Made], None] | None = None,
+    on_progress: OnProgress = unobserved,
 ) -> list[Item]:
     """The items of some splits, at most `max_per_variant` of each variant and split; missing ones are simulated."""
 
     def wanted(item: Item) -> bool:
         return item.split in splits and (max_per_variant is None or item.number < max_per_variant)
 
-    make_suite(suite, folder, workers=workers, on_done=on_done, wanted=wanted)
+    make_suite(suite, folder, workers=workers, on_progress=on_progress, wanted=wanted)
     return [item for item in suite.items() if wanted(item)]
 
 

@@ -11,9 +11,9 @@ import grain
 import jax
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..core.errors import RecordingError
+from ..core.progress import progress_lines
 from ..core.settings import ConfigError
 from ..core.stream import Stream
 from ..recording import Recording
@@ -94,14 +94,9 @@ def _pieces(
             f"hindsight: found {jax.process_count()} processes; expected one, with any number of devices. For several, "
             "objective=coherent."
         )
-    columns = (
-        TextColumn("[bold]{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(),
-    )  # fmt: skip
     found = {}
-    with Progress(*columns, console=console, disable=not config.loop.progress) as progress:
+    with progress_lines(shown=config.loop.progress, console=console) as report:
         for kind, recordings in (("training", training), ("validation", validation)):
-            task = progress.add_task(f"{kind} recordings, segments and masks", total=len(recordings))
             found[kind] = PieceFiles(folder / "pieces" / kind).made(
                 recordings,
                 tracer,
@@ -109,7 +104,7 @@ def _pieces(
                 epcs=config.data.clips.epcs,
                 num_frames=settings.piece_frames,
                 teacher=settings.teacher,
-                on_progress=lambda done, task=task: progress.update(task, completed=done),
+                on_progress=report,
             )
     files, sure = found["training"], found["training"].num_sure(settings)
     if not sure:

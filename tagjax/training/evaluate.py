@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-from rich.progress import track
 
+from ..core.progress import OnProgress, progress_lines
 from ..core.settings import ConfigError, changed
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording import Recording
@@ -75,23 +76,34 @@ def evaluate_tracers(
     work = [(name, number) for name in tracers for number in range(len(recordings))]
     results: dict[str, list[RecordingResult]] = {labels[name]: [] for name in tracers}
     names = recording_names(recordings)
-    for name, number in track(work, description="evaluate", disable=not progress):
-        recording, own = recordings[number], settings.supported_by(tracers[name])
-        kept = overlay_folder(folder, names[number], labels[name])
-        with overlay_video(kept, recording) if own.video else contextlib.nullcontext() as on_picture:
-            result = evaluate_recording(
-                tracers[name],
-                recording,
-                clip_loader(chosen[name]),
-                stride=chosen[name].stride,
-                epcs=epcs,
-                settings=own,
-                frames=frames,
-                on_picture=on_picture,
-            )
-        results[labels[name]].append(result)
-        _write_stages(kept, result, chosen[name], 0 if frames is None else frames[0])
+    lengths = [recordings[number].num_frames if frames is None else frames[1] - frames[0] for _, number in work]
+    with progress_lines(shown=progress) as report:
+        counter = itertools.count()
+        for name, number in work:
+            recording, own = recordings[number], settings.supported_by(tracers[name])
+            kept = overlay_folder(folder, names[number], labels[name])
+            with overlay_video(kept, recording) if own.video else contextlib.nullcontext() as on_picture:
+                result = evaluate_recording(
+                    tracers[name],
+                    recording,
+                    clip_loader(chosen[name]),
+                    stride=chosen[name].stride,
+                    epcs=epcs,
+                    settings=own,
+                    frames=frames,
+                    on_frame=_frame_counter(report, counter, sum(lengths), f"{labels[name]}: {names[number]}"),
+                    on_picture=on_picture,
+                )
+            results[labels[name]].append(result)
+            _write_stages(kept, result, chosen[name], 0 if frames is None else frames[0])
     return write_report(folder, results)
+
+
+def _frame_counter(report: OnProgress, counter: Iterator[int], total: int, now: str) -> Callable[[], None]:
+    """Reports one more frame at each call."""
+    if (done := next(counter)) == 0:
+        report("evaluate", done, total, now)
+    return lambda: report("evaluate", next(counter), total, now)
 
 
 def _write_stages(folder: Path, result: RecordingResult, clips: ClipSettings, first: int) -> None:

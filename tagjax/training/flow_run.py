@@ -153,7 +153,7 @@ def _run(config: TrainFlowConfig, folder: Path, console: Console) -> tuple[float
         values = ", ".join(f"{name} {levels:.2f}" for name, levels in warped.items())
         console.print(f"mean difference of the sequences' images after warping, grey levels of 255: {values}")
     if trained.stopped_by:
-        console.print(f"Stopped at step {steps}; resume with the same command and hydra.run.dir={folder}")
+        console.print(f"Stopped at step {steps}, which is saved.")
     return errors_px["learned"]["all"], trained.stopped_by
 
 

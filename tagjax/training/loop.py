@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import jax
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ..core.interruption import signals_handled
+from ..core.progress import progress_lines
 from .checkpoint import CheckpointError, Checkpoints
 from .logging import Logger
 from .processes import is_first, local_batch_size, max_over_processes
@@ -124,26 +124,17 @@ def train(
     """Train from `state.step` to `num_steps`; a checkpoint is written at the end, and on Ctrl-C, SIGTERM or an error of `samples`.
 
     `update` does one step on this process's part of `batch_size` samples and returns metrics to log, which are the same
-    in all processes; `displayed` lists those beside the progress bar. `validate` returns metrics that are logged under
+    in all processes; `displayed` lists those beside the progress. `validate` returns metrics that are logged under
     `validation/`; `after_step` is called after every step.
 
     A step with `skipped` = 1 leaves the parameters unchanged, and no checkpoint is written after it. Raises
     `DivergedError` after `stop_after_skipped` of them in a row; its message gives the last checkpoint before them.
     """
-    columns = (
-        TextColumn("[bold]train"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[numbers]}", markup=False),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
     first_step, skipped, batch_size = int(state.step), 0, local_batch_size(settings.batch_size)
     done = first_step
-    quiet = not settings.progress or not is_first()
-    with _stop_on_signals() as received, Progress(*columns, disable=quiet) as progress:
-        task = progress.add_task("train", total=settings.num_steps, completed=done, numbers="compiling")
+    shown = settings.progress and is_first()
+    with _stop_on_signals() as received, progress_lines(shown=shown) as report:
+        report("train", done, settings.num_steps, "compiling")
         stopped_by = max_over_processes(received())
         while done < settings.num_steps and not stopped_by:
             place = samples.get_state()
@@ -173,7 +164,7 @@ def train(
             if after_step is not None:
                 after_step(state)
             text = "  ".join(f"{name} {numbers[name]:.3f}" for name in displayed if name in numbers)
-            progress.update(task, completed=done, numbers=text)
+            report("train", done, settings.num_steps, text)
             stopped_by = max_over_processes(received())
         if stopped_by:
             jax.block_until_ready(state.step)

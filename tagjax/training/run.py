@@ -15,6 +15,7 @@ from rich.console import Console
 
 from ..core.folder_lock import locked_folder
 from ..core.interruption import interruption
+from ..core.progress import progress_lines
 from ..core.results import to_json_values, write_json
 from ..recording import Recording
 from ..report.page import PAGE, write_page
@@ -107,9 +108,7 @@ def _run(
         trained, data, logger = _train(config, folder, training, validation, console)
     try:
         if trained.stopped_by:
-            console.print(
-                f"Stopped at step {int(trained.state.step)}; resume with the same command and hydra.run.dir={folder}"
-            )
+            console.print(f"Stopped at step {int(trained.state.step)}, which is saved.")
             raise interruption(trained.stopped_by)
         if not first:
             return float("nan")
@@ -222,7 +221,8 @@ def _report(
         progress=config.loop.progress,
     )
     write_json(folder / "metrics.json", summary)
-    write_page(folder)
+    with progress_lines(shown=config.loop.progress) as report:
+        write_page(folder, on_progress=report)
     return summary
 
 

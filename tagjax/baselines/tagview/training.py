@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, UInt8
 
+from ...core.progress import OnProgress, unobserved
 from ...recording import Recording
 from ..boxes import box_area_px, box_centre_px, box_iou, box_size_px
 from .default_boxes import default_boxes, targets
@@ -106,7 +107,7 @@ def train_detector(
     frames: Sequence[LabelledFrame],
     settings: TrainSettings,
     *,
-    on_step: Callable[[int, float], None] | None = None,
+    on_progress: OnProgress = unobserved,
 ) -> tuple[BoxNetwork, dict[str, Any]]:
     """A network trained on labelled frames, and the settings with the last losses. Raises `ValueError` without a
     frame.
@@ -135,6 +136,7 @@ def train_detector(
 
     defaults = default_boxes(*settings.crop_px)
     start, losses, steps = time.perf_counter(), [], 0
+    on_progress("train", 0, settings.num_steps, "compiling")
     while steps < settings.num_steps and time.perf_counter() - start < settings.max_duration_s:
         chosen = [_crop(frames[int(rng.integers(len(frames)))], settings, rng) for _ in range(settings.batch_size)]
         labelled = [targets(one.objects_px, one.ignored_px, defaults) for one in chosen]
@@ -147,8 +149,7 @@ def train_detector(
         )
         losses.append(float(loss))
         steps += 1
-        if on_step is not None:
-            on_step(steps, losses[-1])
+        on_progress("train", steps, settings.num_steps, f"loss {losses[-1]:.3f}")
     record = {
         **dataclasses.asdict(settings),
         "steps_done": steps,

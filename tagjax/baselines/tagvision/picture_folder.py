@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ...core.progress import OnProgress, unobserved
 from ...recording.image_files import write_image
 from .board_drawing import LocatedBoard, draw_boards
 from .calibration import Board, CalibrationError, CameraCalibration, calibrate, camera_pose, find_corners
@@ -94,7 +95,7 @@ def read_picture(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
-def calibrate_folder(settings: CalibrateSettings) -> FolderCalibration:
+def calibrate_folder(settings: CalibrateSettings, *, on_progress: OnProgress = unobserved) -> FolderCalibration:
     """Find the board in every picture, calibrate, and find the camera's pose if `poses` are given.
 
     Raises `CalibrationError` for a missing folder, no pictures, pictures of several sizes, too few that show the board,
@@ -108,13 +109,15 @@ def calibrate_folder(settings: CalibrateSettings) -> FolderCalibration:
     if not files:
         raise CalibrationError(f"{folder}: no picture in it; expected files ending in {', '.join(SUFFIXES)}.")
     views, used, without, shapes = [], [], [], {}
-    for path in files:
+    for number, path in enumerate(files):
+        on_progress("find the board", number, len(files), path.name)
         picture = read_picture(path)
         shapes.setdefault(picture.shape[:2], path.name)
         corners = find_corners(picture, settings.board)
         (used if corners is not None else without).append(path.name)
         if corners is not None:
             views.append(corners)
+    on_progress("find the board", len(files), len(files))
     if len(shapes) > 1:
         found = ", ".join(f"{width} x {height} ({name})" for (height, width), name in shapes.items())
         raise CalibrationError(

@@ -6,12 +6,13 @@ import dataclasses
 import json
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...core.progress import OnProgress, unobserved
 from ...core.results import markdown_table, write_json
 from .kinds import KINDS
 from .outcome import Outcome, joined
@@ -19,8 +20,6 @@ from .outcome import Outcome, joined
 FORMAT, VERSION = "tagjax-fault-trial", 1
 _MAX_PART = 500
 """Number of faults in a part of a kind, after which progress is shown and results are written."""
-
-OnProgress = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +43,7 @@ def run_trial(
     path: Path,
     *,
     about: Mapping[str, Any] | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = unobserved,
 ) -> dict[str, Any]:
     """Try the kinds of faults, write the results to `path` after each part, and return them.
 
@@ -56,8 +55,7 @@ def run_trial(
     for name in settings.kinds:
         begun, outcomes, done = time.monotonic(), [], 0
         while done < settings.number:
-            if on_progress is not None:
-                on_progress(name, done, settings.number)
+            on_progress(name, done, settings.number)
             part = min(_MAX_PART, settings.number - done)
             outcomes = joined([*outcomes, *_part(name, part, settings.seed, done // _MAX_PART)])
             done += part
@@ -70,8 +68,7 @@ def run_trial(
                 **(about or {}),
             }
             write_json(path, results)
-        if on_progress is not None:
-            on_progress(name, done, settings.number)
+        on_progress(name, done, settings.number)
     return results
 
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ...core.files import write_atomic
+from ...core.progress import OnProgress, unobserved
 from ...core.results import write_json
 from ...core.settings import ConfigError
 from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
@@ -67,20 +68,25 @@ class _Tally:
     num: int = 0
 
 
-def run_comparison(
-    config: CompareConfig, folder: Path, *, on_progress: Callable[[str], None] | None = None
-) -> list[Cell]:
+def run_comparison(config: CompareConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> list[Cell]:
     """Every system on every suite; writes table.md, table.csv, table.json and comparison.png after each suite."""
-    report = on_progress or (lambda _: None)
     folder.mkdir(parents=True, exist_ok=True)
     systems, cells = Systems(config.systems, config.scores), list[Cell]()
+    items, done = config.all_items(on_progress), 0
+    total = sum(map(len, items.values())) * len(config.only)
     for name in config.suites:
-        items = config.items(name, report)
         for system in config.only:
-            cell = _cell(systems, system, name, items, config, report)
+            cell = _cell(systems, system, name, items[name], config, _counter(on_progress, done, total))
+            done += len(items[name])
             cells.append(dataclasses.replace(cell, paper=config.published.get(name, {}).get(system)))
         _write(folder, cells)
+    on_progress("trace", total, total)
     return cells
+
+
+def _counter(on_progress: OnProgress, before: int, total: int) -> Callable[[int, str], None]:
+    """Reports the number of a cell's recording, after `before` recordings of other cells."""
+    return lambda number, now: on_progress("trace", before + number, total, now)
 
 
 def _cell(
@@ -89,13 +95,13 @@ def _cell(
     suite: str,
     items: Sequence[Item],
     config: CompareConfig,
-    report: Callable[[str], None],
+    report: Callable[[int, str], None],
 ) -> Cell:
     if items[0].suite.story == PLANAR:
         return Cell(suite, system, reason="no pictures: lines only")
     tally, reason = _Tally(), None
-    for item in items:
-        report(f"{system}: {item.name}")
+    for number, item in enumerate(items):
+        report(number, f"{system}: {item.name}")
         recording = open_recording(item.path(Path(config.recordings_dir)))
         try:
             _score(systems, system, item, recording, config.scores, tally)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ...core.files import write_atomic
+from ...core.progress import OnProgress, unobserved
 from ...core.results import write_csv, write_json
 from ...core.settings import ConfigError
 from ...metrics.interval import Estimate, estimates
@@ -46,30 +48,31 @@ class BudgetConfig(SuiteSelection):
         return rows | ({TOGETHER: self.swaps} if len(self.swaps) > 1 else {})
 
 
-def run_budget(
-    config: BudgetConfig, folder: Path, *, on_progress: Callable[[str], None] | None = None
-) -> list[BudgetRow]:
+def run_budget(config: BudgetConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> list[BudgetRow]:
     """Every tracer with every combination of swaps on every suite.
 
     Writes table.md, table.csv, result.json and error_budget.png after each recording.
     """
-    report = on_progress or (lambda _: None)
     folder.mkdir(parents=True, exist_ok=True)
     swaps, rows = make_swaps(config.true_reads), list[BudgetRow]()
     quiet = dataclasses.replace(config.scores, num_pictures=0)
     tracers = {name: settings for name, settings in config.tracers.items() if settings is not None}
+    items, numbers = config.all_items(on_progress), itertools.count()
+    total = sum(map(len, items.values())) * len(tracers) * len(config.combinations())
     for suite in config.suites:
         cells = {(tracer, row): list[Scores]() for tracer in tracers for row in config.combinations()}
         found = list[BudgetRow]()
-        for item, recording in config.recordings(suite, report):
+        for item in items[suite]:
+            recording = config.open(item)
             for (tracer, row), scores in cells.items():
-                report(f"{item.name}: {tracer}, {row}")
+                on_progress("trace", next(numbers), total, f"{item.name}: {tracer}, {row}")
                 chosen = [swaps[name] for name in config.combinations()[row]]
                 traces, epcs, stride = swapped_traces(tracers[tracer], item, recording, chosen, quiet)
                 scores.append(score_traces(traces, recording, epcs, stride=stride, settings=quiet).scores())
             found = [_row(suite, tracer, row, scores) for (tracer, row), scores in cells.items()]
             _write(folder, rows + found)
         rows += found
+    on_progress("trace", total, total)
     return rows
 
 

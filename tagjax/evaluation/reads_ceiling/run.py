@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ...core.files import write_atomic
+from ...core.progress import OnProgress, unobserved
 from ...core.results import write_csv, write_json
 from ...core.settings import ConfigError
 from ...metrics.boxes import label_box
@@ -53,27 +54,32 @@ class CeilingConfig(SuiteSelection):
 
 
 def run_ceiling(
-    config: CeilingConfig, folder: Path, *, on_progress: Callable[[str], None] | None = None
+    config: CeilingConfig, folder: Path, *, on_progress: OnProgress = unobserved
 ) -> tuple[list[Row], list[TagRow]]:
     """The ceiling of every suite, memory and tag; writes table.md, table.csv, result.json and ceiling.png.
 
     Raises `RecordingError` for a recording of one tag.
     """
-    report = on_progress or (lambda _: None)
     folder.mkdir(parents=True, exist_ok=True)
-    rows, tags = list[Row](), list[TagRow]()
+    rows, tags, done = list[Row](), list[TagRow](), 0
+    items = config.all_items(on_progress)
+    total = sum(map(len, items.values()))
     for suite in config.suites:
         scores: list[list[Scores]] = [[] for _ in config.memories]
-        for _, recording in config.recordings(suite, report):
+        for item in items[suite]:
+            on_progress("measure", done, total, item.name)
+            recording = config.open(item)
             results = ceilings(recording, config.evidence, config.memories, config.scores)
             for kept, result in zip(scores, results, strict=True):
                 kept.append(result.scores())
             tags += _tag_rows(suite, config.memories, results)
+            done += 1
         for memory, kept in zip(config.memories, scores, strict=True):
             means = estimates([one.means for one in kept])
             undefined = Estimate(None, None, None, 0.0, 0, 0)
             rows.append(Row(suite, memory, {name: means.get(name, undefined) for name in MEASURES}))
         _write(folder, rows, tags)
+    on_progress("measure", done, total)
     return rows, tags
 
 

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ...core.progress import OnProgress, unobserved
 from .markdown import write_pages
-from .measure import Inputs, OnProgress, measure
+from .measure import Inputs, measure
 from .recipe import Recipe
 from .table import begin, filled, read_table, scores_by_recording, table_path, write_table
 
@@ -22,7 +23,7 @@ def make_table(
     finished: Path,
     workers: int = 1,
     confirm: int | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = unobserved,
 ) -> dict[str, Any]:
     """Measure a table, write it to docs/tables below `root` and into its pages, and return it.
 

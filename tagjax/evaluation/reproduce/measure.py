@@ -13,6 +13,7 @@ from typing import Any
 from ...baselines import AbstractHostTracer, host_trace
 from ...baselines.blobs import BlobSettings, BlobTracer
 from ...core.camera import working_stride
+from ...core.progress import OnProgress, unobserved
 from ...core.results import to_json_values, write_json
 from ...core.settings import ConfigError, changed, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording, score_traces
@@ -29,9 +30,6 @@ HOST_TRACERS: Mapping[str, Callable[[Mapping[str, Any]], AbstractHostTracer]] = 
     "blobs": lambda settings: BlobTracer(from_mapping(BlobSettings, settings, where="blobs")),
 }
 """Tracers that run on the host, with settings in conf/system, by name."""
-
-OnProgress = Callable[[str, int, int], None]
-"""Called with a description of the current work, the number of finished recordings, and their total number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +51,7 @@ def measure(
     *,
     before: Mapping[str, Sequence[RecordingScores]] | None = None,
     confirm: int | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = unobserved,
 ) -> dict[Job, list[RecordingScores]]:
     """The scores of every job of a recipe, one element per recording.
 
@@ -64,10 +62,9 @@ def measure(
     """
     if confirm is not None and confirm < 1:
         raise ConfigError(f"confirm is {confirm}; expected 1 or more recordings, or null to trace every one.")
-    report = on_progress or (lambda what, done, total: None)
     jobs = recipe.jobs()
     tracings = {job: _tracing(recipe, inputs, job) for job in jobs}  # wrong settings raise before the work starts
-    items = {draw: _items(inputs, *draw, report) for draw in dict.fromkeys(map(_recordings_key, jobs))}
+    items = {draw: _items(inputs, *draw, on_progress) for draw in dict.fromkeys(map(_recordings_key, jobs))}
     total = sum(len(items[_recordings_key(job)]) for job in jobs)
     numbers = itertools.count()
     scores: dict[Job, list[RecordingScores]] = {job: [] for job in jobs}
@@ -75,7 +72,7 @@ def measure(
     for draw in items:
         for position, item in enumerate(items[draw]):
             for job in (job for job in jobs if _recordings_key(job) == draw):
-                report(f"{item.name}: {job.system}", next(numbers), total)
+                on_progress("trace", next(numbers), total, f"{item.name}: {job.system}")
                 known = earlier[job].get(item.name)
                 if known is None or confirm is None or position < confirm:
                     found = tracings[job].scores(item, inputs)
@@ -84,7 +81,7 @@ def measure(
                 else:
                     found = known
                 scores[job].append(found)
-    report("measured", total, total)
+    on_progress("trace", total, total)
     return scores
 
 
@@ -183,17 +180,7 @@ def _items(inputs: Inputs, name: str, split: str, seeds: Sequence[int] | None, r
         suites = [dataclasses.replace(own, name=f"{own.name}-seed{seed}", seed=seed) for seed in seeds]
     recordings: list[Item] = []
     for suite in suites:
-        items = [item for item in suite.items() if item.split == split]
-        num_existing = sum(item.path(inputs.recordings).exists() for item in items)
-        report(f"simulate {suite.name}", num_existing, len(items))
-        done, num = itertools.count(num_existing + 1), len(items)
-        recordings += make_items(
-            suite,
-            inputs.recordings,
-            splits=(split,),
-            workers=inputs.workers,
-            on_done=lambda one, done=done, num=num: report(f"simulated {one.name}", next(done), num),
-        )
+        recordings += make_items(suite, inputs.recordings, splits=(split,), workers=inputs.workers, on_progress=report)
     if not recordings:
         raise ConfigError(f"suite {name}: found no {split} recording; choose another split, or raise its counts.")
     return recordings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from ...core.files import write_atomic
+from ...core.progress import OnProgress, unobserved
 from ...core.results import write_json
 from ...recording.importers.tagged_walks import load_tagged, load_uwb
 from .association import METHODS, accuracy, association_scores, windows
@@ -19,23 +20,26 @@ from .scenes import TracksConfig, load_scenes
 from .tables import markdown, real_tags_markdown
 
 
-def run_tracks(config: TracksConfig, folder: Path, *, on_done: Callable[[str], None] = print) -> dict[str, Any]:
+def run_tracks(config: TracksConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> dict[str, Any]:
     """Accuracy of every method by scene and window length; writes `metrics.json`, `tables.md` and `accuracy.png`.
 
     Where there are real tags, their results are in both files as well, and `real_tags.png` shows them.
     """
-    rows = []
-    for scene in load_scenes(config):
+    rows, done = [], 0
+    scenes = load_scenes(config)
+    for scene in scenes:
         for length_s in config.windows_s:
+            on_progress("score", done, len(scenes) * len(config.windows_s), f"{scene.name}, {length_s:g} s")
             sampled = windows(scene, length_s, config)
             scored = (association_scores(window, seed=number) for number, window in enumerate(sampled))
             results = zip(
                 (len(one.distance_m) for one in sampled), (one.carrier for one in sampled), scored, strict=True
             )
             rows += _accuracy(scene.name, length_s, METHODS, results)
-            on_done(f"{scene.name}, {length_s:g} s")
+            done += 1
+    on_progress("score", done, done)
     accuracy_plot(folder / "accuracy.png", rows, METHODS)
-    real = score_real_tags(config, folder, on_done)
+    real = score_real_tags(config, folder, on_progress)
     write_json(folder / "metrics.json", {"virtual_tags": rows, **real})
     text = "Virtual tags on real tracks: fraction of windows in which the carrier scores highest.\n\n" + markdown(
         rows, METHODS
@@ -44,23 +48,24 @@ def run_tracks(config: TracksConfig, folder: Path, *, on_done: Callable[[str], N
     return {"rows": rows, **real}
 
 
-def score_real_tags(config: TracksConfig, folder: Path, on_done: Callable[[str], None]) -> dict[str, Any]:
+def score_real_tags(config: TracksConfig, folder: Path, on_progress: OnProgress) -> dict[str, Any]:
     """Association of the real tags of the folder, by whole recordings and by windows; empty where there are none."""
     home, rows, whole = Path(config.folder), [], []
     scenes = {
         "kinect-rfid": load_tagged(home / "kinect-rfid", config.frame_rate_hz),
         "xovis-uwb": load_uwb(home / "xovis-uwb", config.frame_rate_hz, config.xovis_unit_m),
     }
-    for name, tagged in scenes.items():
+    for number, (name, tagged) in enumerate(scenes.items()):
         if not tagged:
             continue
-        on_done(f"{name}, real tags")
+        on_progress("score real tags", number, len(scenes), name)
         associations = associate(tagged)
         whole += associations
         for length_s in config.windows_s:
             sampled = [window for one in associations for window in speed_windows(one, length_s, config.min_move_m)]
             scored = ((len(one.distance_m), one.carrier, speed_scores(one)) for one in sampled)
             rows += _accuracy(name, length_s, SCORES, scored)
+    on_progress("score real tags", len(scenes), len(scenes))
     if not whole:
         return {}
     speeds_plot(folder / "real_tags.png", whole)

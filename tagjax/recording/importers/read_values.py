@@ -89,7 +89,7 @@ def stamp_ns(text: str | None) -> int:
             if seconds.isdigit() and (fraction.isdigit() or not fraction):
                 return int(seconds) * factor + round(float(f"0.{fraction or 0}") * factor)
             return round(value * factor)
-    return int(value)
+    return int(text) if text.isdigit() else int(value)
 
 
 def microseconds_ns(row: Row, name: str) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,10 +11,15 @@ import numpy as np
 
 from ...core.errors import RecordingError
 from ...radio.reader import ReaderSettings
-from ..recording import Recording
+from ..reads import TagReads
+from ..recording import ClockAudit, Recording
 from ..store import save_recording
 from ..virtual_tags import attach_virtual_tags, load_tracks_csv
 from .registration import estimate_folder_correction
+from .rgbd.bags import Topics
+from .rgbd.formats import FORMATS, SourceOptions, open_source, recognise
+from .rgbd.streaming import stream_recording
+from .rgbd.times import start_time_ns
 from .rgbd_folder import import_jpg_mat, import_tum
 from .tables import ImportReport, import_table
 
@@ -23,8 +28,12 @@ from .tables import ImportReport, import_table
 class ImportSettings:
     """A video, a table of reads, or both; and the folder of the new recording."""
 
-    video: str | None = None
-    video_format: str = "auto"  # tum | jpg_mat | auto
+    video: str | None = None  # file or folder; rgbd/formats.py lists the formats
+    video_format: str = "auto"  # auto, or a name of rgbd.formats.FORMATS
+    camera: str | None = None  # camera file (JSON or YAML), where it is not beside the video
+    start: Any = None  # time of the first frame (ISO, or seconds since 1970), for videos without times of day
+    max_gap_s: float | None = None  # between a colour picture and its depth; null: the camera file's, or 0.02
+    topics: Topics = dataclasses.field(default_factory=Topics)  # bag: the topics, where they are not found
     calibration: str | None = None  # jpg_mat: .mat with cam_params
     correction: Any = None  # jpg_mat: residual correction of the calibration: null | 7 numbers | estimate
     masks: str | None = None  # jpg_mat: folder of label images
@@ -42,7 +51,9 @@ class ImportSettings:
 
 
 def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[str]]:
-    """Import the data that `settings` name; returns the recording (None for a table alone) and a report, line by line.
+    """Import the data that `settings` name; returns the recording and a report, line by line.
+
+    The recording is None for a table alone, and for a video that is streamed (all but tum and jpg_mat) without `out`.
 
     The recording is checked and, if `out` is given, saved. Raises `RecordingError` for data that cannot be imported.
     """
@@ -62,8 +73,39 @@ def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[s
         report += _table_lines(table_report, reads)
     if settings.video is None:
         return None, report
-    recording = _video(settings, report)
-    recording = dataclasses.replace(recording, antennas_m=np.asarray(settings.antennas_m, float))
+    path = Path(settings.video)
+    chosen = settings.video_format
+    if chosen == "auto" or not path.exists():
+        chosen = recognise(path, settings.camera)
+    if chosen not in FORMATS:
+        raise RecordingError(f"video_format={chosen}: expected auto, {', '.join(FORMATS)}.")
+
+    def complete(video: Recording) -> Recording:
+        return _complete(settings, video, table, report)
+
+    if chosen in ("tum", "jpg_mat"):
+        recording = complete(_lazy_video(settings, path, chosen, report))
+        if settings.out is not None:
+            save_recording(recording, settings.out, progress=True)
+    else:
+        if settings.correction is not None:
+            raise RecordingError(
+                "correction is for a folder of .jpg and .mat; state the registration in the camera file."
+            )
+        recording = _streamed(settings, path, chosen, complete, report)
+    if settings.out is not None:
+        report.append(f"saved as {settings.out}")
+    return recording, report
+
+
+def _complete(
+    settings: ImportSettings,
+    video: Recording,
+    table: tuple[TagReads, ClockAudit | None] | None,
+    report: list[str],
+) -> Recording:
+    """The video with antennas and reads, checked and described."""
+    recording = dataclasses.replace(video, antennas_m=np.asarray(settings.antennas_m, float))
     if table is not None:
         recording = dataclasses.replace(recording, reads=table[0], clock=table[1])
     if settings.tracks is not None:
@@ -75,26 +117,36 @@ def import_recording(settings: ImportSettings) -> tuple[Recording | None, list[s
         f"{recording.num_frames} frames of {recording.intrinsics.width} x {recording.intrinsics.height}, "
         f"{recording.frame_rate_hz:.1f} frames/s; {recording.source}"
     )
-    if settings.out is not None:
-        save_recording(recording, settings.out, progress=True)
-        report.append(f"saved as {settings.out}")
-    return recording, report
+    return recording
 
 
-def _video(settings: ImportSettings, report: list[str]) -> Recording:
-    assert settings.video is not None
-    folder = Path(settings.video)
+def _streamed(
+    settings: ImportSettings, path: Path, chosen: str, complete: Callable[[Recording], Recording], report: list[str]
+) -> Recording | None:
+    """A video written frame by frame to `out`; without `out` its first lines are described."""
+    source = open_source(path, chosen, SourceOptions(settings.camera, settings.start, settings.topics))
+    report += source.lines()
+    if settings.out is None:
+        report.append("nothing was written: give out=<new>.zarr")
+        return None
+    return stream_recording(
+        source,
+        Path(settings.out),
+        complete,
+        start_ns=start_time_ns(settings.start) if chosen != "video" else None,
+        max_gap_s=settings.max_gap_s,
+        progress=True,
+    )
+
+
+def _lazy_video(settings: ImportSettings, folder: Path, chosen: str, report: list[str]) -> Recording:
+    """A folder whose frames are decoded when they are saved."""
     if not folder.is_dir():
         raise RecordingError(f"video={folder}: no such folder.")
-    chosen = settings.video_format
-    if chosen == "auto":
-        chosen = "tum" if (folder / "rgb.txt").is_file() else "jpg_mat"
     if chosen == "tum":
         if settings.correction is not None:
             raise RecordingError("correction is for a folder of .jpg and .mat; TUM RGB-D is registered already.")
         return import_tum(folder)
-    if chosen != "jpg_mat":
-        raise RecordingError(f"video_format={chosen}: expected auto, tum or jpg_mat.")
     if settings.calibration is None:
         raise RecordingError("A folder of .jpg and .mat needs its calibration: give calibration=<file.mat>.")
     given = _correction(settings.correction)

@@ -8,6 +8,7 @@ from pathlib import Path
 from string import Template
 
 from ...core.files import write_atomic
+from ...core.progress import OnProgress, unobserved
 from . import sections
 from .contents import Contents, read_contents
 from .html import Html, element, escaped, together
@@ -20,18 +21,19 @@ MAX_RECORDINGS = 40
 """Recordings with a section of their own, the worst ones; the table has all."""
 
 
-def write_page(run: Path, path: Path | None = None) -> Path:
+def write_page(run: Path, path: Path | None = None, *, on_progress: OnProgress = unobserved) -> Path:
     """Write the page of a run folder and return its path, `report.html` in the folder by default.
 
-    It is made from the folder's files alone: nothing is traced again. Raises `ValueError` where they hold no report.
+    It is made from the folder's files alone: nothing is traced again. `on_progress` counts videos. Raises `ValueError`
+    where the folder holds no report.
     """
     contents = read_contents(run)
     path = run / PAGE if path is None else path
-    write_atomic(path, page_text(contents, path))
+    write_atomic(path, page_text(contents, path, on_progress))
     return path
 
 
-def page_text(contents: Contents, path: Path) -> str:
+def page_text(contents: Contents, path: Path, on_progress: OnProgress = unobserved) -> str:
     """The page's HTML; `path` is where it will lie, for links to videos that it cannot hold."""
     script, style = _template("page.js"), palette_css() + _template("page.css")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -40,7 +42,7 @@ def page_text(contents: Contents, path: Path) -> str:
     parts = [
         ("Result", "result", sections.headline(contents)),
         ("Worst cases", "worst", sections.worst(contents)),
-        ("Recordings", "recordings", _recordings(contents, shown, path)),
+        ("Recordings", "recordings", _recordings(contents, shown, path, on_progress)),
         ("Scores since the first motion", "curves", sections.motion(contents)),
         ("Where box IoU is lost", "budget", sections.budget(contents)),
         ("Scores of each recording", "table", sections.recordings_table(contents)),
@@ -69,9 +71,9 @@ def _title(contents: Contents) -> str:
     return f"{contents.tracers[0]} on {where}"
 
 
-def _recordings(contents: Contents, shown: list[str], path: Path) -> Html:
+def _recordings(contents: Contents, shown: list[str], path: Path, on_progress: OnProgress) -> Html:
     """A part that opens for each recording, the worst first."""
-    videos = page_videos(contents, shown)
+    videos = page_videos(contents, shown, on_progress)
     parts = [_recording(contents, name, place, videos, path) for place, name in enumerate(shown)]
     left = len(contents.recordings()) - len(shown)
     note = element("p", f"{left} more recordings are in the table below.", class_="note") if left else None

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from ...core.progress import OnProgress, unobserved
 from ..video import smaller_video
 from .contents import Contents
 from .html import Html, data_uri, element
@@ -55,24 +56,28 @@ def _player(source: str, num_frames: int) -> Html:
     )
 
 
-def page_videos(contents: Contents, recordings: Sequence[str]) -> dict[tuple[str, str], PageVideo]:
+def page_videos(
+    contents: Contents, recordings: Sequence[str], on_progress: OnProgress = unobserved
+) -> dict[tuple[str, str], PageVideo]:
     """The videos by recording and tracer: within the page as many as it may hold, the first tracer's worst recordings first.
 
     The first one is made smaller where it is too large.
     """
     chosen: dict[tuple[str, str], PageVideo] = {}
     left = VIDEO_BYTES
-    for tracer in contents.tracers:
-        for recording in recordings:
-            path = contents.video(recording, tracer)
-            if path is None:
-                continue
-            size = path.stat().st_size
-            content = None
-            if size <= left:
-                content = path.read_bytes()
-            elif not chosen or left >= _SMALLEST:
-                content = smaller_video(path, left)
-            left -= 0 if content is None else len(content)
-            chosen[recording, tracer] = PageVideo(path, content)
+    wanted = [(recording, tracer) for tracer in contents.tracers for recording in recordings]
+    for number, (recording, tracer) in enumerate(wanted):
+        on_progress("videos of the page", number, len(wanted), f"{tracer}: {recording}")
+        path = contents.video(recording, tracer)
+        if path is None:
+            continue
+        size = path.stat().st_size
+        content = None
+        if size <= left:
+            content = path.read_bytes()
+        elif not chosen or left >= _SMALLEST:
+            content = smaller_video(path, left)
+        left -= 0 if content is None else len(content)
+        chosen[recording, tracer] = PageVideo(path, content)
+    on_progress("videos of the page", len(wanted), len(wanted))
     return chosen

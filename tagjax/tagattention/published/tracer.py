@@ -36,6 +36,22 @@ class PublishedState(eqx.Module):
     num_frames: Float[Array, ""]
 
 
+class PublishedStages(eqx.Module):
+    """What one step computes on its way to the masks, for pictures of the stages; pixels of the working resolution."""
+
+    motion_m: Float[Array, "height width window"]  # rho of Eq. 4: change of range since the window's first frame
+    complete: Bool[Array, "height width"]  # the motion is known over the whole window
+    step_m: Float[Array, "height width"]  # change of range since the last frame, 0 = unknown
+    recent: Bool[Array, "height width"]  # that change is known
+    moves: Bool[Array, " tag"]  # Eq. 7: the tag is as fast as v0
+    attention: Float[Array, "tag height width"]  # Eq. 6; 0 where the motion is unknown
+    carried: Float[Array, "tag height width"]  # the log likelihood of the last frame, moved along the flow
+    probability: Float[Array, "tag height width"]  # exp(l), normalised to 0 to 1
+    cut: Bool[Array, "tag height width"]  # the mask before the refinement
+    mask: Float[Array, "tag height width"]  # the refined mask
+    cluster: Int[Array, "height width"]  # K-means cluster of each pixel
+
+
 def _scalar(value: float | Array) -> Float[Array, ""]:
     return jnp.asarray(value, jnp.float32)
 
@@ -84,6 +100,14 @@ class TagAttentionPublished(AbstractTracer):
         )
 
     def step(self, camera: Camera, state: PublishedState, frame: Frame) -> tuple[PublishedState, Trace]:
+        after, stages = self.stages(camera, state, frame)
+        points = camera.rays * frame.depth_m[..., None]
+        number = jnp.sum(stages.mask, axis=(1, 2))
+        centre = jnp.einsum("thw,hwc->tc", stages.mask, points) / jnp.maximum(number, 1.0)[:, None]
+        return after, describe(stages.mask, centre, stages.step_m[None], stages.recent)
+
+    def stages(self, camera: Camera, state: PublishedState, frame: Frame) -> tuple[PublishedState, PublishedStages]:
+        """The next state, and all that a step computes on its way."""
         points = camera.rays * frame.depth_m[..., None]
         valid = frame.depth_m > 0
         range_m = jnp.where(valid, camera.ranges_m(points)[0], 0.0)
@@ -116,33 +140,46 @@ class TagAttentionPublished(AbstractTracer):
             log_likelihood: Float[Array, "height width"],
             relative_m: Float[Array, " window"],
             std_m: Float[Array, " window"],
-        ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
+        ) -> tuple[Array, ...]:
             rd = relative_m - relative_m[0]
             every = jnp.ones(rho.shape, bool)
             radial = att_rbf(rho, rd[None, None], every, self.alpha_m2[None, None])
             agreement = attention(radial, att_corr(rho, rd[None, None], every), self.beta)
-            agreement = jnp.maximum(jnp.where(complete, agreement, 0.0), self.floor)
+            agreement = jnp.where(complete, agreement, 0.0)
             moves = jnp.all(jnp.isfinite(std_m)) & (radio_speed(rd, time_s) >= self.v0_m_s)
-            log_likelihood = log_likelihood + jnp.where(moves, jnp.log(agreement), 0.0)
-            return self._masked(log_likelihood, valid, cluster)
+            evidence = jnp.where(moves, jnp.log(jnp.maximum(agreement, self.floor)), 0.0)
+            return moves, agreement, *self._masked(log_likelihood + evidence, valid, cluster)
 
-        likelihood, mask = jax.vmap(one_tag)(
+        moves, agreement, probability, cut, likelihood, mask = jax.vmap(one_tag)(
             jnp.moveaxis(carried, -1, 0), frame.radio.relative_m[:, 0], frame.radio.std_m[:, 0]
         )
-        number = jnp.sum(mask, axis=(1, 2))
-        centre = jnp.einsum("thw,hwc->tc", mask, points) / jnp.maximum(number, 1.0)[:, None]
-        step_m = jnp.where(known[..., -1] & valid, range_m - history[..., -1], 0.0)
-        trace = describe(mask, centre, step_m[None], known[..., -1] & valid)
         after = PublishedState(range_m, history, known, time_s, likelihood, centres, state.num_frames + 1)
-        return after, trace
+        recent = known[..., -1] & valid
+        stages = PublishedStages(
+            motion_m=rho,
+            complete=complete,
+            step_m=jnp.where(recent, range_m - history[..., -1], 0.0),
+            recent=recent,
+            moves=moves,
+            attention=agreement,
+            carried=jnp.moveaxis(carried, -1, 0),
+            probability=probability,
+            cut=cut,
+            mask=mask,
+            cluster=cluster.reshape(valid.shape),
+        )
+        return after, stages
 
     def _masked(
         self,
         log_likelihood: Float[Array, "height width"],
         valid: Bool[Array, "height width"],
         cluster: Int[Array, " pixel"],
-    ) -> tuple[Float[Array, "height width"], Float[Array, "height width"]]:
-        """The refined likelihood, which is propagated, and the refined mask; where nothing stands out, no mask."""
+    ) -> tuple[Array, ...]:
+        """The normalised likelihood, its cut, the refined likelihood, which is propagated, and the refined mask.
+
+        Where nothing stands out, there is no mask.
+        """
         top = jnp.max(jnp.where(valid, log_likelihood, -jnp.inf))
         odds = jnp.where(valid, jnp.exp(log_likelihood - jnp.where(jnp.isfinite(top), top, 0.0)), 0.0)
         least = jnp.min(jnp.where(valid, odds, jnp.inf))
@@ -154,7 +191,7 @@ class TagAttentionPublished(AbstractTracer):
         mean, _ = means(normal.reshape(-1, 1), mask, cluster, num)
         mask = mask.reshape(shape)
         raised = jnp.where(mask, jnp.maximum(normal, mean[cluster, 0].reshape(shape)), normal)
-        return jnp.log(jnp.maximum(raised, self.lowest)), mask.astype(log_likelihood.dtype)
+        return normal, cut, jnp.log(jnp.maximum(raised, self.lowest)), mask.astype(log_likelihood.dtype)
 
     def finish(self, state: PublishedState) -> PublishedState:
         return state

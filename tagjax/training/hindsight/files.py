@@ -14,6 +14,7 @@ import safetensors.numpy
 
 from ...core.array_file import named_arrays
 from ...core.files import make_folder, remove, write_atomic
+from ...core.progress import OnProgress, unobserved
 from ...core.results import write_json
 from ...radio.arrivals import Arrivals
 from ...radio.reads import RadioWindow
@@ -44,21 +45,22 @@ class PieceFiles:
         epcs: Sequence[str] | None,
         num_frames: int,
         teacher: Teacher = "smoother",
-        on_progress: Callable[[int], None] = lambda done: None,
+        on_progress: OnProgress = unobserved,
     ) -> PieceFiles:
         """The folder with the pieces of all recordings; those that it holds already are not computed again.
 
-        `on_progress` is called with the number of recordings that are done.
+        `on_progress` counts the recordings.
         """
         make_folder(self.folder)
-        on_progress(len(self._index()))
+        stage = f"{self.folder.name} recordings: segments and masks"
         for recording in recordings[len(self._index()) :]:
             tags, names, index = selected_tags(recording, epcs), [], self._index()
+            on_progress(stage, len(index), len(recordings), recording.name)
             for piece in segment_pieces(recording, tracer, load, epcs=tags, num_frames=num_frames, teacher=teacher):
                 names.append(f"{len(index):04d}-{len(names):03d}.safetensors")
                 _write(self.folder / names[-1], piece)
             write_json(self.folder / _INDEX, [*index, names])
-            on_progress(len(index) + 1)
+            on_progress(stage, len(index) + 1, len(recordings))
         return self
 
     def num_sure(self, settings: HindsightSettings) -> int:

@@ -1,9 +1,9 @@
-"""What is learned from hindsight: the soft mask, made from the past alone, should be the smoother's mask."""
+"""What is learned from hindsight: the mask, made from the past alone, should be the teacher's, and the confidence say how well."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,21 +56,32 @@ class HindsightSettings:
     ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
         """The loss of a piece, and what it consists of."""
         assert isinstance(tracer, TagAttention)
-        missed, claimed, num_there, num_away = hindsight_sums(tracer, camera, frames, self)
-        loss = safe_divide(missed + claimed, num_there + num_away)
+        sums = hindsight_sums(tracer, camera, frames, self)
+        loss = safe_divide(sums.missed, sums.num_there) + safe_divide(sums.wrong, sums.num_there + sums.num_away)
         return {"hindsight": loss}, {
-            "overlap": 1.0 - safe_divide(missed, num_there),
-            "false_confidence": safe_divide(claimed, num_away),
+            "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
+            "false_confidence": safe_divide(sums.claimed, sums.num_away),
         }
+
+
+class HindsightSums(NamedTuple):
+    """Sums over the tag-frames of which the teacher is sure, and their numbers."""
+
+    missed: Float[Array, ""]  # 1 - IoU where the teacher sees the object
+    wrong: Float[Array, ""]  # (confidence - IoU)^2 everywhere; the IoU is 0 where the teacher sees nothing
+    claimed: Float[Array, ""]  # confidence where it sees nothing
+    num_there: Float[Array, ""]
+    num_away: Float[Array, ""]
 
 
 def hindsight_sums(
     tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Sums over the tag-frames of which the teacher is sure, and their numbers.
+) -> HindsightSums:
+    """The two questions of each tag-frame: where the object is, and how sure one may be of it.
 
-    Where it sees the object: 1 - soft IoU of its mask with the tracer's mask times confidence, on segments weighted by
-    their areas. Where it sees none: the tracer's confidence.
+    IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should say
+    this IoU: its squared error is least where it is the IoU that is to be expected (a proper score; Brier, 1950), so that no
+    share of frames with and without an object makes it too sure. The IoU carries no gradient there.
     """
     num_antennas, num_tags = camera.antennas_m.shape[0], frames.present.shape[1]
     window = frames.radio.relative_m.shape[-1]
@@ -78,9 +89,9 @@ def hindsight_sums(
     def step(state: Any, frame: PieceFrames) -> tuple[Any, tuple[Array, Array, Array]]:
         state = faded(state, settings.memory)
         state, out = tracer.associate(camera, state, frame.found, frame_of(frame, num_antennas))
-        mask, area = out.membership * out.confidence[:, None], frame.found.area
-        both = mask * frame.target
-        overlap = safe_divide(both @ area, (mask + frame.target - both) @ area)
+        area = frame.found.area
+        both = out.membership * frame.target
+        overlap = safe_divide(both @ area, (out.membership + frame.target - both) @ area)
         return state, (overlap, out.confidence, frame.target @ area)
 
     state = tracer.no_reads(num_tags, num_antennas, window, frames.time_s[0])
@@ -88,6 +99,13 @@ def hindsight_sums(
     _, (overlap, confidence, size) = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), state, frames)
     there = frames.present & (frames.confidence > settings.sure) & (size > 0)
     away = frames.present & (frames.confidence < 1.0 - settings.sure)
-    missed = jnp.sum(jnp.where(there, 1.0 - overlap, 0.0))
-    claimed = jnp.sum(jnp.where(away, confidence, 0.0))
-    return missed, claimed, jnp.sum(there.astype(missed.dtype)), jnp.sum(away.astype(missed.dtype))
+    expected = jax.lax.stop_gradient(jnp.where(there, overlap, 0.0))
+    wrong = jnp.where(there | away, (confidence - expected) ** 2, 0.0)
+
+    return HindsightSums(
+        missed=jnp.sum(jnp.where(there, 1.0 - overlap, 0.0)),
+        wrong=jnp.sum(wrong),
+        claimed=jnp.sum(jnp.where(away, confidence, 0.0)),
+        num_there=jnp.sum(there.astype(wrong.dtype)),
+        num_away=jnp.sum(away.astype(wrong.dtype)),
+    )

@@ -16,6 +16,7 @@ import numpy as np
 
 from ....core.files import write_atomic
 from ....core.names import plain_label
+from ....core.progress import OnProgress, unobserved
 from ....core.results import write_json
 from ....recording import Recording
 from ....recording.suite_folder import SPLITS, SuiteRecording, find_recordings
@@ -104,7 +105,7 @@ def run_goller(
     folder: Path,
     *,
     open_recording: Callable[[str], Recording],
-    on_progress: Callable[[str], None] | None = None,
+    on_progress: OnProgress = unobserved,
 ) -> dict[str, Any]:
     """The paper's evaluation on simulated recordings; returns the content of `metrics.json`.
 
@@ -119,14 +120,17 @@ def run_goller(
     calibration = calibrate(grid, floor_dbm=config.floor_dbm, fit_means=config.fit_means)
     statistic = grid_statistic(grid, find_room_frame(grid))
     figures.antenna_plot(folder / "antennas.png", statistic, calibration.location.antennas)
-    splits, observe_ms = _observe_splits(config, open_recording, on_progress or (lambda _: None))
+    splits, observe_ms = _observe_splits(config, open_recording, on_progress)
     known, test = splits["train"] + splits["validation"], splits["test"]
     losses = np.zeros(0)
     if config.fit_steps:
+        on_progress("fit", 0, 1, f"{config.fit_steps} steps")
         pairs = [(example.observed, example.truth) for example in splits["train"]]
         calibration, losses = fit_association(
             calibration, pairs, config.settings, num_steps=config.fit_steps, learning_rate=config.learning_rate
         )
+        on_progress("fit", 1, 1)
+    on_progress("score", 0, 3, "thresholds")
     fused, rfid = thresholds(outcomes(calibration, known, config.settings))
     calibration = eqx.tree_at(
         lambda c: (c.alarm_threshold, c.rssi_threshold_dbm),
@@ -134,15 +138,18 @@ def run_goller(
         (jnp.asarray(fused, jnp.float32), jnp.asarray(rfid, jnp.float32)),
     )
     save_calibration(calibration, folder / "calibration.json")
+    on_progress("score", 1, 3, "outcomes")
     start = time.perf_counter()
     found = outcomes(calibration, test, config.settings)
     estimate_ms = 1e3 * (time.perf_counter() - start) / max(sum(len(one.observed.time_s) for one in test), 1)
     simple, scenarios = simple_rates(found, fused, rfid), scenario_rates(found, fused)
+    on_progress("score", 2, 3, "ablation")
     conditions = sensor_ablation(calibration, known, test, config.settings)
     at_paper = rates_at_paper_false_alarms(found)
     write_atomic(folder / "tables.md", rate_tables(simple, scenarios, at_paper) + "\n" + ablation_table(conditions))
     _roc_plot(folder, found, simple)
     errors = location_error_m(calibration, test, config.settings)
+    on_progress("score", 3, 3)
     metrics = {
         "table_1": {name: row.to_json() for name, row in simple.items()},
         "table_1_at_papers_false_alarms": {
@@ -150,7 +157,7 @@ def run_goller(
         },
         "table_2": {name: row.to_json() for name, row in scenarios.items()},
         "ablation": {name: {key: row.to_json() for key, row in rows.items()} for name, rows in conditions.items()},
-        "handover": _handovers(folder, config, calibration, open_recording),
+        "handover": _handovers(folder, config, calibration, open_recording, on_progress),
         "thresholds": {"fused": fused, "rfid_dbm": rfid},
         "fitted": _fitted(calibration),
         "fit_loss": [float(losses[0]), float(losses[-1])] if len(losses) else None,
@@ -165,19 +172,19 @@ def run_goller(
 
 
 def _observe_splits(
-    config: GollerExperiment, open_recording: Callable[[str], Recording], on_progress: Callable[[str], None]
+    config: GollerExperiment, open_recording: Callable[[str], Recording], on_progress: OnProgress
 ) -> tuple[dict[str, list[Example]], float]:
     """The examples of each split, and the time a frame took, ms."""
     start, num_frames = time.perf_counter(), 0
-    splits: dict[str, list[Example]] = {}
-    for split in SPLITS:
-        splits[split] = []
-        for one in config.scenario_recordings(split):
-            recording = open_recording(str(one.path))
-            observed = observe(recording, config.settings)
-            splits[split].append(Example(one.variant, observed, true_tags(recording)))
-            num_frames += recording.num_frames
-            on_progress(f"observed {recording.name}")
+    splits: dict[str, list[Example]] = {split: [] for split in SPLITS}
+    work = [(split, one) for split in SPLITS for one in config.scenario_recordings(split)]
+    for number, (split, one) in enumerate(work):
+        on_progress("observe", number, len(work), one.path.stem)
+        recording = open_recording(str(one.path))
+        observed = observe(recording, config.settings)
+        splits[split].append(Example(one.variant, observed, true_tags(recording)))
+        num_frames += recording.num_frames
+    on_progress("observe", len(work), len(work))
     return splits, 1e3 * (time.perf_counter() - start) / num_frames
 
 
@@ -208,6 +215,7 @@ def _handovers(
     config: GollerExperiment,
     calibration: Calibration,
     open_recording: Callable[[str], Recording],
+    on_progress: OnProgress,
 ) -> dict[str, Any] | None:
     """Fig. 7 for every tag of the first recording, and the summary of all recordings; None without any."""
     from .. import figures
@@ -217,6 +225,7 @@ def _handovers(
         return None
     found: list[Handover] = []
     for number, path in enumerate(paths):
+        on_progress("hand-overs", number, len(paths))
         recording = open_recording(path)
         observed, truth = observe(recording, config.settings), true_tags(recording)
         estimates, states = estimate(calibration, observed, config.settings), true_states(observed, truth)
@@ -238,6 +247,7 @@ def _handovers(
         if number == 0:
             threshold = float(calibration.alarm_threshold)
             _scene_picture(folder / "handover_scene.png", recording, observed, estimates, threshold)
+    on_progress("hand-overs", len(paths), len(paths))
     if found:
         figures.handover_plot(folder / "handover_mean.png", found)
     return summarise_handovers(found, len(paths))

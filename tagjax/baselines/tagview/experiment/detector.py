@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ....core.progress import OnProgress, unobserved
 from ....core.results import write_json
 from ....recording.store import open_recording
 from ....recording.suite_folder import find_recordings
@@ -29,9 +29,7 @@ class DetectorTraining:
     validation_stride: int = 4  # every how many validation frames are used
 
 
-def train_tagview(
-    config: TagviewExperiment, folder: Path, *, on_step: Callable[[int, float], None] | None = None
-) -> dict[str, Any]:
+def train_tagview(config: TagviewExperiment, folder: Path, *, on_progress: OnProgress = unobserved) -> dict[str, Any]:
     """Train the detector on the suites' train split, measure it on the validation split, write its weights.
 
     Raises `ValueError` for suites without train recordings; suites without validation recordings are not measured.
@@ -50,7 +48,7 @@ def train_tagview(
             validation += labelled_frames(
                 recording, stride=training.validation_stride, min_side_px=settings.min_side_px
             )
-    network, record = train_detector(train, settings, on_step=on_step)
+    network, record = train_detector(train, settings, on_progress=on_progress)
     chosen = dataclasses.replace(config.system.detector, kind="ssd")
     scores = measure_detector(BoxDetector(network, chosen), validation) if validation else {}
     about = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ....core.files import write_atomic
 from ....core.numerics import SPEED_OF_LIGHT_M_S
+from ....core.progress import OnProgress, unobserved
 from ....core.results import write_csv, write_json
 from ....recording import Recording
 from ....recording.store import open_recording
@@ -90,13 +91,10 @@ def _count(variant: str) -> int:
     return _COUNTS.index(variant) if variant in _COUNTS else -1
 
 
-def run_tagview(
-    config: TagviewExperiment, folder: Path, *, on_progress: Callable[[str, int, int], None] | None = None
-) -> dict[str, Any]:
+def run_tagview(config: TagviewExperiment, folder: Path, *, on_progress: OnProgress = unobserved) -> dict[str, Any]:
     """Track and identify all recordings; writes `metrics.json`, `report.md`, `recordings.csv` and plots.
 
-    Returns the metrics. `on_progress` gets the recording's name, its number and the number of recordings. Raises
-    `ValueError` for suites without recordings and for recordings to which Tagview does not apply.
+    Returns the metrics. `on_progress` counts the recordings. Raises `ValueError` for suites without recordings and for recordings to which Tagview does not apply.
     """
     from .. import figures
 
@@ -107,19 +105,21 @@ def run_tagview(
     mm_per_px, num_rows = [], 0
     for number, (group, path) in enumerate(todo):
         recording = open_recording(path)
-        if on_progress is not None:
-            on_progress(recording.name, number, len(todo))
+        on_progress("track", number, len(todo), recording.name)
         reason = tracer.inapplicable(recording)
         if reason is not None:
             raise ValueError(f"{recording.name}: Tagview does not apply: {reason}")
         tracked = track_recording(tracer, recording)
-        for name, score in _score_settings(config, tracer, recording, tracked).items():
+        for name, score in score_settings(
+            config.matching, config.system.min_trace_s, tracer, recording, tracked
+        ).items():
             scores.setdefault(group, {}).setdefault(name, []).append(score)
         mm_per_px.append(tracked.mm_per_px)
         num_rows = recording.image_shape[0]
         if number == 0:
             picture = np.asarray(recording.colour[0])
             figures.track_plot(folder / "tracks.png", tracked.name, tracked.truth_px, tracked.box_px, picture)
+    on_progress("track", len(todo), len(todo))
     metrics = _metrics(config, scores, float(np.mean(mm_per_px)), num_rows)
     main = [one for group in scores.values() for one in group[config.main]]
     pairs = [one for one in main if not one.recording.startswith(_SAME_PHASE)]
@@ -132,15 +132,19 @@ def run_tagview(
     return metrics
 
 
-def _score_settings(
-    config: TagviewExperiment, tracer: TagviewTracer, recording: Recording, tracked: TrackedRecording
+def score_settings(
+    matching: Mapping[str, Matching],
+    min_trace_s: float,
+    tracer: TagviewTracer,
+    recording: Recording,
+    tracked: TrackedRecording,
 ) -> dict[str, RecordingScore]:
-    """The recording's score with every setting."""
+    """The recording's score with every setting, on the same tracks; traces shorter than `min_trace_s` do not count."""
     carrier_hz = float(np.nanmedian(recording.reads.carrier_hz))
     true_slope = 4 * np.pi * plane_depth_m(recording) * carrier_hz / SPEED_OF_LIGHT_M_S
-    min_frames = max(round(config.system.min_trace_s * recording.frame_rate_hz), 1)
+    min_frames = max(round(min_trace_s * recording.frame_rate_hz), 1)
     scores = {}
-    for name, setting in config.matching.items():
+    for name, setting in matching.items():
         found, _ = tracer.identify(tracked.camera, tracked.state, setting.match, setting.reads)
         scores[name] = score_recording(tracked, found, min_frames=min_frames, true_slope=true_slope)
     return scores

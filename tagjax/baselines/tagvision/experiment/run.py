@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ....core.files import write_atomic
+from ....core.progress import OnProgress, unobserved
 from ....core.results import write_csv, write_json
 from ....core.settings import ConfigError, from_mapping
 from ....recording.store import open_recording
@@ -52,25 +54,20 @@ class TagVisionExperiment:
             raise ConfigError("matching is empty; expected at least one setting to match with.")
 
 
-def run_tagvision(
-    config: TagVisionExperiment, folder: Path, *, on_progress: Callable[[str], None] | None = None
-) -> dict[str, Any]:
+def run_tagvision(config: TagVisionExperiment, folder: Path, *, on_progress: OnProgress = unobserved) -> dict[str, Any]:
     """Run the configured experiments; writes `metrics.json`, `table.md`, `tags.csv` and plots, returns the metrics.
 
     Raises `ConfigError`, before any work, for a suite without pictures.
     """
-    report = on_progress or (lambda _: None)
     suite = None if config.suite is None else _table_suite(config.suite)
     folder.mkdir(parents=True, exist_ok=True)
     metrics: dict[str, Any] = {"paper": PAPER}
     if config.lines:
-        report("parallel lines")
-        metrics["lines"] = _lines(config.lines, folder)
-    report("calibration")
-    metrics["calibration"] = _calibrations(config)
+        metrics["lines"] = _lines(config.lines, folder, on_progress)
+    metrics["calibration"] = _calibrations(config, on_progress)
     if suite is not None:
-        items = _simulate(config, suite.smoke() if config.smoke else suite, report)
-        metrics["tracks"] = _tracks(config, items, folder, report)
+        items = _simulate(config, suite.smoke() if config.smoke else suite, on_progress)
+        metrics["tracks"] = _tracks(config, items, folder, on_progress)
     write_json(folder / "metrics.json", metrics)
     write_atomic(folder / "table.md", report_markdown(metrics))
     return metrics
@@ -88,27 +85,26 @@ def _table_suite(values: Mapping[str, Any]) -> Suite:
     return suite
 
 
-def _simulate(config: TagVisionExperiment, suite: Suite, report: Callable[[str], None]) -> list[Item]:
+def _simulate(config: TagVisionExperiment, suite: Suite, report: OnProgress) -> list[Item]:
     """The suite's recordings of the split, simulated where missing."""
     from ....sim.suites import make_suite
 
-    make_suite(
-        suite,
-        Path(config.recordings_dir),
-        workers=config.workers,
-        on_done=lambda made: report(f"simulated {made.name}"),
-    )
+    make_suite(suite, Path(config.recordings_dir), workers=config.workers, on_progress=report)
     items = [item for item in suite.items() if item.split == config.split]
     if not items:
         raise ConfigError(f"{suite.name} has no {config.split} recording: raise suite.counts.{config.split}.")
     return items
 
 
-def _lines(settings: Sequence[LineSettings], folder: Path) -> dict[str, dict[str, float]]:
+def _lines(settings: Sequence[LineSettings], folder: Path, report: OnProgress) -> dict[str, dict[str, float]]:
     from .. import figures
     from .lines import line_scores
 
-    scores = [line_scores(one) for one in settings]
+    scores = []
+    for number, one in enumerate(settings):
+        report("parallel lines", number, len(settings), one.name)
+        scores.append(line_scores(one))
+    report("parallel lines", len(settings), len(settings))
     summaries = [one.summary() for one in scores]
     titles = [
         f"{one.name} ({one.reference}): truth best in {summary['truth_is_maximum_fraction_of_rounds']:.0%} of rounds"
@@ -119,33 +115,34 @@ def _lines(settings: Sequence[LineSettings], folder: Path) -> dict[str, dict[str
     return {one.name: summary for one, summary in zip(settings, summaries, strict=True)}
 
 
-def _calibrations(config: TagVisionExperiment) -> dict[str, Any]:
+def _calibrations(config: TagVisionExperiment, report: OnProgress) -> dict[str, Any]:
     """Mean transform error on a table of 1.2 x 2 m seen from 2 m by the paper's camera, with the board at one position
     or at several."""
     true, several = overhead(PAPER_CAMERA, (0.02, 0.03, 2.0)), config.calibration.num_board_positions
-    out = {}
+    out, numbers = {}, itertools.count()
+    total = 2 * config.num_calibrations
     for name, count in (("one_place", 1), (f"{several}_places", several)):
         errors = []
         for seed in range(config.num_calibrations):
+            report("calibration", next(numbers), total)
             settings = dataclasses.replace(
                 config.calibration, num_board_positions=count, seed=config.calibration.seed + seed
             )
             found = simulate_calibration(true, _AREA_M, settings)
             errors.append(transform_error_m(found, true, _AREA_M, pixel_noise_px=settings.corner_noise_px).mean())
         out[name] = {"transform_error_mm": float(np.mean(errors)) * 1e3, "worst_mm": float(np.max(errors)) * 1e3}
+    report("calibration", total, total)
     return out
 
 
-def _tracks(
-    config: TagVisionExperiment, items: Sequence[Item], folder: Path, report: Callable[[str], None]
-) -> dict[str, Any]:
+def _tracks(config: TagVisionExperiment, items: Sequence[Item], folder: Path, report: OnProgress) -> dict[str, Any]:
     """Blob matching and tracking error on the suite's recordings, each with a calibration of its own."""
     from .table_truth import table_truth
 
     results: dict[str, list[TagResult]] = {name: [] for name in config.matching}
     transform_mm = []
     for number, item in enumerate(items):
-        report(f"{item.name} ({number + 1} of {len(items)})")
+        report("track", number, len(items), item.name)
         recording = open_recording(item.path(Path(config.recordings_dir)))
         truth = table_truth(item, recording)
         settings = dataclasses.replace(config.calibration, seed=config.calibration.seed + 1000 + number)
@@ -155,6 +152,7 @@ def _tracks(
         tracked = track_recording(recording, camera, config.system)
         for name, matching in config.matching.items():
             results[name] += score_tags(tracked, recording, truth, matching, windows_s=config.windows_s)
+    report("track", len(items), len(items))
     _write_tags(folder / "tags.csv", results)
     summaries = {name: summarise(tags) for name, tags in results.items()}
     _plot_tracks(folder, results, summaries)

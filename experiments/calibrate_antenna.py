@@ -1,0 +1,36 @@
+"""Find an antenna's offset from the camera, from a recording in which one tag is moved about. The last line is the result as JSON.
+
+python -m experiments.calibrate_antenna recording=recordings/moved.zarr epc=E28011000000000000000001
+python -m experiments.calibrate_antenna recording=recordings/moved.zarr epc=E28011000000000000000001 path=traced antenna=2
+
+Move the tag for 20 s through half a metre and more along all three axes, in view, near the antenna, nothing in between.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from .command import checked, command, print_result
+
+
+@command
+def main(values: dict[str, Any], folder: Path) -> None:
+    from rich.console import Console
+
+    from tagjax.evaluation.antenna_position import AntennaConfig, calibrate_antenna
+
+    from .progress import counting_bar
+
+    progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
+    config = checked(AntennaConfig, values, folder)
+    with counting_bar(console, shown=progress) as bar:
+        task = bar.add_task("trace", total=None)
+        found = calibrate_antenna(config, on_frame=lambda done, total: bar.update(task, completed=done, total=total))
+    console.print("\n".join(found.lines()))
+    print_result(dataclasses.asdict(found))
+
+
+if __name__ == "__main__":
+    main()
