@@ -19,15 +19,13 @@ from .command import checked, command, print_result
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.evaluation.antenna_position import AntennaConfig, calibrate_antenna
-
-    from .progress import counting_bar
 
     progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
     config = checked(AntennaConfig, values, folder)
-    with counting_bar(console, shown=progress) as bar:
-        task = bar.add_task("trace", total=None)
-        found = calibrate_antenna(config, on_frame=lambda done, total: bar.update(task, completed=done, total=total))
+    with progress_lines(shown=progress, console=console) as report:
+        found = calibrate_antenna(config, on_frame=lambda done, total: report("trace", done, total))
     console.print("\n".join(found.lines()))
     print_result(dataclasses.asdict(found))
 

@@ -16,18 +16,14 @@ from .command import checked, command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.evaluation.check import CheckConfig, check_recording
     from tagjax.report.check_page import check_text
 
-    from .progress import counting_bar
-
     progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
     config = checked(CheckConfig, values, folder)
-    with counting_bar(console, shown=progress) as bar:
-        task = bar.add_task("frames", total=None)
-        limits, page = check_recording(
-            config, folder, on_frame=lambda done, total: bar.update(task, completed=done, total=total)
-        )
+    with progress_lines(shown=progress, console=console) as report:
+        limits, page = check_recording(config, folder, on_frame=lambda done, total: report("frames", done, total))
     console.print(check_text(limits))
     print(page)
 

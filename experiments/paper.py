@@ -23,21 +23,15 @@ from .suites import suites_named
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.core.settings import from_mapping
     from tagjax.evaluation.paper import PaperConfig, run_paper, suites
-
-    from .progress import counting_bar
 
     progress, console = values.pop("progress"), Console(markup=False)
     config = from_mapping(PaperConfig, {**values, "suites": suites_named(suites())})
     write_config(values, folder)
-    with counting_bar(console, shown=progress) as bar:
-        task = bar.add_task("paper", total=None)
-        drawn = run_paper(
-            config,
-            folder,
-            on_progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
-        )
+    with progress_lines(shown=progress, console=console) as report:
+        drawn = run_paper(config, folder, on_progress=lambda done, total, now: report("figures", done, total, now))
     for one in drawn:
         console.print(f"{one.title}: {one.picture or one.seen}", soft_wrap=True, highlight=False)
     console.print(f"figures.md, figures.json and the figures in {folder}", soft_wrap=True, highlight=False)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tagjax.core.progress import unobserved
 from tagjax.core.settings import from_mapping
 from tagjax.evaluation.tracks.association import METHODS, accuracy, association_scores, windows
 from tagjax.evaluation.tracks.real_tags import (
@@ -173,6 +174,7 @@ def test_noise_of_a_track_costs_the_doubled_angle_more_than_flips_cost_the_plain
 
 def test_the_configuration_names_every_setting():
     values: dict[str, Any] = yaml.safe_load((Path(__file__).parents[1] / "conf" / "tracks.yaml").read_text())
+    assert values.pop("progress") is True  # read by the command itself
     values.pop("defaults")
     assert from_mapping(TracksConfig, {**values, "folder": "x"}) == TracksConfig("x")
     assert set(values) == {field.name for field in dataclasses.fields(TracksConfig)}
@@ -306,7 +308,7 @@ def test_real_tags_are_identified_with_antennas_placed_by_other_recordings(tagge
         straight = np.corrcoef(window.distance_m[1], -np.cumsum(window.towards_m_s))[0, 1]
         assert scores["Tagview, R^2"][1] == pytest.approx(max(straight, 0.0) ** 2, abs=1e-9)
     config = TracksConfig(str(tagged_folder), windows_s=(1.0, 4.0), frame_rate_hz=RATE_HZ)
-    real = score_real_tags(config, tmp_path, lambda name: None)
+    real = score_real_tags(config, tmp_path, unobserved)
     short, long = real["real_tags"]
     for name in SCORES:
         assert long["accuracy"][name] >= short["accuracy"][name] - 0.05
@@ -316,7 +318,7 @@ def test_real_tags_are_identified_with_antennas_placed_by_other_recordings(tagge
     assert "| 2-5-2020 |" in text
     assert "|  |  |  | ...99 |" in text
     assert "...70, of another recording" in text
-    assert score_real_tags(TracksConfig(str(tmp_path)), tmp_path, print) == {}
+    assert score_real_tags(TracksConfig(str(tmp_path)), tmp_path, unobserved) == {}
     assert real_tags_markdown({}) == ""
 
 

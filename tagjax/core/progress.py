@@ -78,11 +78,13 @@ def _on_terminal(console: Console) -> bool:
 def tracked(items: Iterable[T], stage: str, total: int | None = None, *, shown: bool = True) -> Iterator[T]:
     """The same items; on a terminal a line counts them while they are used. `total` is their number, if they have no `len`."""
     number = len(items) if total is None and isinstance(items, Sized) else total or 0
+    done = 0
     with progress_lines(shown=shown, kept=False) as report:
-        for done, item in enumerate(items):
+        for item in items:
             report(stage, done, number)
             yield item
-        report(stage, number, number)
+            done += 1
+        report(stage, done, done)
 
 
 def rate_text(per_s: float | None) -> str:

@@ -240,7 +240,7 @@ def traced_path_m(recording: Recording, config: AntennaConfig, on_frame: Callabl
 
 def _smoothed(time_s: np.ndarray, path_m: np.ndarray) -> np.ndarray:
     """A Gaussian mean over the known frames around each known frame."""
-    known = np.isfinite(path_m).all(axis=1)
+    known = np.asarray(np.isfinite(path_m).all(axis=1))
     weight = np.exp(-0.5 * ((time_s[:, None] - time_s[None, :]) / _SMOOTH_S) ** 2) * known
     mean = weight @ np.where(known[:, None], path_m, 0.0) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
     return np.where(known[:, None], mean, np.nan)

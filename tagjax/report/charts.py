@@ -10,11 +10,12 @@ from jaxtyping import Float, Float64, UInt8
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from .overlay import PALETTE_RGB
 
 _DPI = 100
-_TEXT = {"size": 8.0}
+_TEXT_PT = 8.0
 _GREY = "0.45"
 _PHASE_TICKS = ([0.0, np.pi, 2 * np.pi], ["0", "π", "2π"])
 
@@ -53,9 +54,9 @@ class GrowingCharts:
     ) -> None:
         self._tags, self._frame_s = tags, frame_s
         self._changes = [tag.changes_m() for tag in tags]
-        self._figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
+        layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.04, hspace=0.0)
+        self._figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, layout=layout)
         self._canvas = FigureCanvasAgg(self._figure)
-        self._figure.get_layout_engine().set(w_pad=0.08, h_pad=0.04, hspace=0.0)  # pyright: ignore[reportOptionalMemberAccess]
         *phases, distance = self._figure.subplots(
             len(tags) + 1, 1, sharex=True, height_ratios=[*[1.0] * len(tags), 2.4]
         )
@@ -63,10 +64,10 @@ class GrowingCharts:
         self._points = [
             _phase_axes(axes, tag, _colour(n)) for n, (axes, tag) in enumerate(zip(phases, tags, strict=True))
         ]
-        phases[0].set_title("phase of each read, rad", loc="left", pad=4.0, **_TEXT)
+        phases[0].set_title("phase of each read, rad", loc="left", pad=4.0, fontsize=_TEXT_PT)
         self._lines = _distance_axes(distance, self._changes)
         distance.set_xlim(0.0, 1.01 * max(float(frame_s[-1]), 1e-3))
-        distance.set_xlabel("time, s", labelpad=1.0, **_TEXT)
+        distance.set_xlabel("time, s", labelpad=1.0, fontsize=_TEXT_PT)
         self._figure.draw_without_rendering()
         self._figure.set_layout_engine("none")  # or the axes would move a little at each frame
 
@@ -95,7 +96,7 @@ def _phase_axes(axes: Axes, tag: TagCurves, colour: tuple[float, float, float]):
     """Axes of a tag's phase, empty; the points, which are set later."""
     _plain(axes)
     axes.set_ylim(-0.4, 2 * np.pi + 0.4)
-    axes.set_yticks(*_PHASE_TICKS, **_TEXT)
+    axes.set_yticks(*_PHASE_TICKS, fontsize=_TEXT_PT)
     axes.tick_params(labelbottom=False)
     axes.annotate(
         tag.name,
@@ -105,7 +106,7 @@ def _phase_axes(axes: Axes, tag: TagCurves, colour: tuple[float, float, float]):
         textcoords="offset points",
         ha="right",
         va="bottom",
-        **_TEXT,
+        fontsize=_TEXT_PT,
     )
     (points,) = axes.plot([], [], linestyle="", marker="o", markersize=2.2, color=colour)
     return points
@@ -114,13 +115,13 @@ def _phase_axes(axes: Axes, tag: TagCurves, colour: tuple[float, float, float]):
 def _distance_axes(axes: Axes, changes: Sequence[tuple[np.ndarray, np.ndarray]]):
     """Axes of the change of distance; of each tag the line of its mask and that of the truth, empty."""
     _plain(axes)
-    axes.set_title("change of distance, m", loc="left", pad=4.0, **_TEXT)
+    axes.set_title("change of distance, m", loc="left", pad=4.0, fontsize=_TEXT_PT)
     values = np.concatenate([np.concatenate(pair) for pair in changes])
     values = values[np.isfinite(values)]
     low, high = (values.min(), values.max()) if len(values) else (-1.0, 1.0)
     margin = 0.06 * max(high - low, 0.1)
     axes.set_ylim(low - margin, high + margin)
-    axes.tick_params(labelsize=_TEXT["size"])
+    axes.tick_params(labelsize=_TEXT_PT)
     lines = []
     for tag in range(len(changes)):
         (mask,) = axes.plot([], [], color=_colour(tag), linewidth=1.8, solid_capstyle="round", label="mask")
@@ -133,7 +134,7 @@ def _distance_axes(axes: Axes, changes: Sequence[tuple[np.ndarray, np.ndarray]])
         loc="lower right",
         bbox_to_anchor=(1.0, 0.98),
         ncols=2,
-        fontsize=_TEXT["size"],
+        fontsize=_TEXT_PT,
         frameon=False,
         handlelength=1.6,
         borderpad=0.0,

@@ -83,7 +83,7 @@ class Sources:
                 splits=self._splits_with(suite, splits)[: 1 if one else None],
                 max_per_variant=limit,
                 workers=config.workers,
-                on_done=lambda made: self.report(f"simulated {made.name}"),
+                on_progress=lambda stage, done, total, now="": self.report(f"{stage}, {done} of {total}"),
             )
         else:
             found = [item for item in suite.items() if item.split in splits and item.path(folder).exists()]

@@ -39,7 +39,9 @@ def judged(value: float, limits: tuple[float, float]) -> Verdict:
     if not np.isfinite(value):
         return "not measured"
     sign = 1.0 if good > bad else -1.0
-    return "good" if sign * value >= sign * good else "bad" if sign * value < sign * bad else "limits"
+    if sign * value >= sign * good:
+        return "good"
+    return "bad" if sign * value < sign * bad else "limits"
 
 
 def worst_verdict(verdicts: list[Verdict]) -> Verdict:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import zarr
-from rich.progress import Progress, TextColumn
 
 from ....core.errors import RecordingError
 from ....core.files import atomic_path
+from ....core.progress import tracked
 from ...reads import TagReads
 from ...recording import Recording
 from ...store import write_all_but_frames
@@ -72,21 +72,17 @@ def _write_frames(source: RgbdSource, root: zarr.Group, max_gap_s: float, progre
     """Colour and depth of all pairs; the recording with them, which has no reads yet."""
     views, tally, times = Views(source.rig), Tally(), []
     arrays: tuple[_Growing, _Growing] | None = None
-    columns = (TextColumn("{task.description}"), TextColumn("{task.completed:.0f} frames"))
-    with Progress(*columns, disable=not progress, transient=True) as bar:
-        task = bar.add_task(source.name, total=None)
-        for colour, depth in pairs(source.pictures(), max_gap_s, tally):
-            frames = (views.colour(colour), views.depth(depth))
-            if arrays is None:
-                arrays = (_Growing(root, "colour", frames[0]), _Growing(root, "depth", frames[1]))
-            if frames[1].dtype != arrays[1].array.dtype:
-                raise RecordingError(
-                    f"{depth.where}: depth is stored in another type than in the first picture; expected one type."
-                )
-            for array, frame in zip(arrays, frames, strict=True):
-                array.append(frame)
-            times.append(colour.time_ns)
-            bar.advance(task)
+    for colour, depth in tracked(pairs(source.pictures(), max_gap_s, tally), source.name, shown=progress):
+        frames = (views.colour(colour), views.depth(depth))
+        if arrays is None:
+            arrays = (_Growing(root, "colour", frames[0]), _Growing(root, "depth", frames[1]))
+        if frames[1].dtype != arrays[1].array.dtype:
+            raise RecordingError(
+                f"{depth.where}: depth is stored in another type than in the first picture; expected one type."
+            )
+        for array, frame in zip(arrays, frames, strict=True):
+            array.append(frame)
+        times.append(colour.time_ns)
     tally.check(source.name, max_gap_s)
     assert arrays is not None
     for array in arrays:
