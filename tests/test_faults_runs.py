@@ -329,7 +329,7 @@ def test_every_file_is_written_whole_or_not_at_all() -> None:
         "tagjax/core/files.py",
         "tagjax/training/logging.py",  # metrics.jsonl grows by lines; an incomplete last one is dropped
         "tagjax/evaluation/sweep.py",  # lines.jsonl as well
-        "tagjax/evaluation/stream.py",  # frames.jsonl as well
+        "tagjax/live/stream.py",  # frames.jsonl and events.jsonl as well
     }
     files = [path for folder in ("tagjax", "experiments") for path in (ROOT / folder).rglob("*.py")]
     found = {

@@ -22,7 +22,7 @@ LAYERS = (
     {"tracing"},
     {"tagattention", "metrics"},
     {"report"},
-    {"training", "baselines"},
+    {"training", "baselines", "live"},
     {"evaluation", "benchmarks"},
 )
 """Packages from the bottom up. A package imports only packages of the layers below its own."""

@@ -14,7 +14,9 @@ from synthetic_clips import recording
 from test_segment_tracer import CONF, scene
 
 from tagjax.core.settings import ConfigError
-from tagjax.evaluation.stream import Milliseconds, StreamConfig, run_stream
+from tagjax.live.config import StreamConfig
+from tagjax.live.durations import Milliseconds
+from tagjax.live.stream import run_stream
 from tagjax.recording.store import save_recording
 from tagjax.tracing.replay import Replay, ReplaySettings
 

@@ -19,7 +19,7 @@ from mkdocs.structure.files import File
 
 PACKAGES = (
     "core", "image", "radio", "recording", "flow", "sim", "tracing", "tagattention", "metrics", "report", "training",
-    "baselines", "evaluation",
+    "baselines", "live", "evaluation",
 )  # fmt: skip
 """Packages with a page in the reference, from the bottom up."""
 

@@ -57,7 +57,6 @@ def draw_overlay(
     """
     scale = -(-MIN_WIDTH // colour.shape[1])
     picture = np.ascontiguousarray(colour.repeat(scale, axis=0).repeat(scale, axis=1))
-    masks = masks.repeat(scale, axis=1).repeat(scale, axis=2)
     boxes_px = boxes_px * scale
     true_boxes_px = None if true_boxes_px is None else true_boxes_px * scale
     labels: list[tuple[str, tuple[int, int, int, int], tuple[int, int, int]]] = []
@@ -68,7 +67,7 @@ def draw_overlay(
             cv2.rectangle(picture, (x0, y0), (x1, y1), (255, 255, 255), 1)
         if not detected[tag] or not np.all(np.isfinite(boxes_px[tag])):
             continue
-        mask = masks[tag]
+        mask = masks[tag].repeat(scale, axis=0).repeat(scale, axis=1)
         tinted = 0.65 * picture[mask].astype(np.float32) + 0.35 * np.array(shade, np.float32)
         picture[mask] = tinted.astype(np.uint8)
         outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

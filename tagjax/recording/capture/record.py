@@ -18,9 +18,9 @@ from .camera import CameraError
 from .finish import Finished, finish_recording
 from .progress import Progress
 from .reads import CapturedRead, ReaderError, ReaderEvent, ReaderInfo
-from .settings import RecordConfig, Sensors, make_reader, make_sensors
+from .settings import RecordConfig, SensorConfig, Sensors, make_reader, make_sensors
 from .writer import RecordingWriter, VideoFormat
-from .writing_thread import FilmingThread, Threads, WritingThread
+from .writing_thread import FilmingThread, Sink, Threads, WritingThread
 
 _STATUS_S = 1.0
 _POLL_S = 0.05
@@ -75,7 +75,7 @@ async def _record(
     threads, error = Threads(FilmingThread(sensors.camera, writing), writing), None
     try:
         async with sensors.emulator or contextlib.nullcontext():
-            reading = asyncio.create_task(_read(config, sensors, threads.writing, progress))
+            reading = asyncio.create_task(hand_over_reads(config, sensors, threads.writing, progress))
             try:
                 with signals_handled(lambda *_: loop.call_soon_threadsafe(stop.set)):
                     await _until_the_end(config, sensors, threads, reading, stop, progress, on_status)
@@ -92,8 +92,11 @@ async def _record(
     return stop.is_set(), threads.error or error
 
 
-async def _read(config: RecordConfig, sensors: Sensors, writing: WritingThread, progress: Progress) -> None:
-    """Hand over what the reader's stream yields. A playback begins where the reader is connected first."""
+async def hand_over_reads(config: SensorConfig, sensors: Sensors, sink: Sink, progress: Progress) -> None:
+    """Hand over what the reader's stream yields. A playback begins where the reader is connected first.
+
+    It does not end by itself. Raises `ReaderError`.
+    """
     async with contextlib.aclosing(make_reader(config, sensors).stream()) as items:
         async for item in items:
             if isinstance(item, ReaderEvent):
@@ -105,7 +108,7 @@ async def _read(config: RecordConfig, sensors: Sensors, writing: WritingThread, 
                 item = ReaderEvent("malformed", text)
                 progress.event(item)
             assert isinstance(item, CapturedRead | ReaderEvent | ReaderInfo)
-            writing.put(item)
+            sink.put(item)
 
 
 async def _until_the_end(

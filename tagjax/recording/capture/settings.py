@@ -20,21 +20,15 @@ from .reader import AbstractReader, ConnectionSettings, InventorySettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RecordConfig:
-    """Which sensors are recorded, and where to. Raises `ConfigError` for settings that do not fit together."""
+class SensorConfig:
+    """Which sensors are used. Raises `ConfigError` for settings that do not fit together."""
 
     camera: Literal["playback", "realsense", "orbbec", "k4a"] = "playback"
     reader: Literal["llrp", "r700", "playback"] = "playback"
-    out: str | None = None
-    finish: str | None = None  # a recording that was cut off
     recording: str | None = None  # that is played
-    name: str | None = None  # None: that of `out`
     address: str | None = None  # of the reader: <host> or <host>:<port>; https://<host> of an R700
     emulate: bool = False  # the reader is an emulated one on loopback, with the reads of `recording`
     antennas_m: tuple[tuple[float, float, float], ...] | None = None  # None: those of `recording`
-    duration_s: float | None = None
-    commit_s: float = 0.5
-    preview: bool = True
     camera_settings: CameraSettings = dataclasses.field(default_factory=CameraSettings)
     inventory: InventorySettings = dataclasses.field(default_factory=InventorySettings)
     connection: ConnectionSettings = dataclasses.field(default_factory=ConnectionSettings)
@@ -42,14 +36,9 @@ class RecordConfig:
     emulator: EmulatorSettings = dataclasses.field(default_factory=EmulatorSettings)
 
     def __post_init__(self) -> None:
-        if (self.out is None) == (self.finish is None):
-            raise ConfigError("found neither out nor finish, or both; expected out=<a new folder>.zarr.")
-        if self.commit_s <= 0 or (self.duration_s is not None and self.duration_s <= 0):
-            raise ConfigError(f"commit_s is {self.commit_s}, duration_s {self.duration_s}; expected positive seconds.")
-        plays = "playback" in (self.camera, self.reader) or self.emulate
-        if self.finish is None and plays and self.recording is None:
+        if ("playback" in (self.camera, self.reader) or self.emulate) and self.recording is None:
             raise ConfigError("recording is null; expected the recording that is played. Give recording=<a recording>.")
-        if self.finish is None and self.reader != "playback" and (self.address is None) != self.emulate:
+        if self.reader != "playback" and (self.address is None) != self.emulate:
             raise ConfigError(
                 f"reader is {self.reader}, address is {self.address}, emulate is {self.emulate}; expected either the reader's "
                 "address, or emulate=true."
@@ -58,7 +47,7 @@ class RecordConfig:
             raise ConfigError(
                 "reader is playback, which needs no emulator; expected emulate=false, or reader=llrp or r700."
             )
-        if self.antennas_m is None and self.recording is None and self.finish is None:
+        if self.antennas_m is None and self.recording is None:
             raise ConfigError("antennas_m is null; expected the antennas' positions in the camera frame, in metres.")
         if self.antennas_m is not None and self.reader != "playback" and not self.emulate:
             self._check_ports(len(self.antennas_m))
@@ -69,6 +58,26 @@ class RecordConfig:
             raise ConfigError(
                 f"inventory.antennas names port {highest}, antennas_m has {num_antennas} positions; expected one for every port."
             )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordConfig(SensorConfig):
+    """Which sensors are recorded, and where to. Raises `ConfigError` for settings that do not fit together."""
+
+    out: str | None = None
+    finish: str | None = None  # a recording that was cut off
+    name: str | None = None  # None: that of `out`
+    duration_s: float | None = None
+    commit_s: float = 0.5
+    preview: bool = True
+
+    def __post_init__(self) -> None:
+        if (self.out is None) == (self.finish is None):
+            raise ConfigError("found neither out nor finish, or both; expected out=<a new folder>.zarr.")
+        if self.commit_s <= 0 or (self.duration_s is not None and self.duration_s <= 0):
+            raise ConfigError(f"commit_s is {self.commit_s}, duration_s {self.duration_s}; expected positive seconds.")
+        if self.finish is None:
+            super().__post_init__()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,13 +92,13 @@ class Sensors:
     emulator: AbstractEmulator | None
 
 
-def make_sensors(config: RecordConfig) -> Sensors:
+def make_sensors(config: SensorConfig) -> Sensors:
     """Camera and emulator. Raises `RecordingError` for a recording that cannot be played."""
     played, start = None if config.recording is None else open_recording(config.recording), PlaybackStart()
     if config.antennas_m is not None:
         antennas_m = np.array(config.antennas_m, np.float64)
     else:
-        assert played is not None  # RecordConfig has checked it
+        assert played is not None  # SensorConfig has checked it
         antennas_m = np.asarray(played.antennas_m, np.float64)
     if config.camera == "playback":
         assert played is not None
@@ -113,7 +122,7 @@ def make_sensors(config: RecordConfig) -> Sensors:
     return Sensors(camera, antennas_m, start, played, source, emulator)
 
 
-def _emulator(config: RecordConfig, played: Recording, start: PlaybackStart) -> AbstractEmulator:
+def _emulator(config: SensorConfig, played: Recording, start: PlaybackStart) -> AbstractEmulator:
     origin_ns = int(played.time_ns[0])
     if config.reader == "llrp":
         from .llrp_emulator import LlrpEmulator
@@ -124,7 +133,7 @@ def _emulator(config: RecordConfig, played: Recording, start: PlaybackStart) -> 
     return R700Emulator(played.reads, origin_ns, start=start, settings=config.emulator)
 
 
-def make_reader(config: RecordConfig, sensors: Sensors) -> AbstractReader:
+def make_reader(config: SensorConfig, sensors: Sensors) -> AbstractReader:
     """The reader. Raises `ReaderError` for an address or a package that is missing."""
     if config.reader == "playback":
         assert sensors.played is not None

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,6 +22,13 @@ MAX_FRAME_BYTES = 1 << 28
 
 MAX_READS = 200_000
 _PREVIEW_WIDTH = 320
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """What takes the items of camera and reader, from any thread, without waiting."""
+
+    def put(self, item: VideoFormat | CameraFrame | CapturedRead | ReaderEvent | ReaderInfo) -> None: ...
 
 
 class WritingThread:
@@ -148,9 +155,9 @@ def write_preview(path: Path, frame: CameraFrame) -> None:
 
 
 class FilmingThread:
-    """Opens a camera and hands its frames to the writing thread, until it is closed or the camera has no more."""
+    """Opens a camera and hands its frames to the writing thread, or to another sink, until it is closed or the camera has no more."""
 
-    def __init__(self, camera: AbstractCamera, writing: WritingThread):
+    def __init__(self, camera: AbstractCamera, writing: Sink):
         self.error: Exception | None = None
         self.camera, self._writing, self._closing = camera, writing, threading.Event()
         self._thread = threading.Thread(target=self._run, name="filming", daemon=True)

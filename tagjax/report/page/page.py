@@ -35,7 +35,7 @@ def write_page(run: Path, path: Path | None = None, *, on_progress: OnProgress =
 
 def page_text(contents: Contents, path: Path, on_progress: OnProgress = unobserved) -> str:
     """The page's HTML; `path` is where it will lie, for links to videos that it cannot hold."""
-    script, style = _template("page.js"), _template("page.css")
+    script, style = _template("page.js"), palette_css() + _template("page.css")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     title = _title(contents)
     shown = contents.recordings()[:MAX_RECORDINGS]
@@ -135,6 +135,11 @@ def _recording(contents: Contents, name: str, place: int, videos: dict[tuple[str
         data_begin=f"{times_s[0]:.4f}",
         data_end=f"{times_s[-1]:.4f}",
     )
+
+
+def palette_css() -> str:
+    """The colours of the pages, light and dark, as variables of CSS: paper, ink, and c0 to c7 of the tags."""
+    return _template("palette.css")
 
 
 def _template(name: str) -> str:
