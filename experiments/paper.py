@@ -15,11 +15,11 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from .command import command, print_result, write_config
+from .command import print_result, resumable_command, write_config
 from .suites import suites_named
 
 
-@command
+@resumable_command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
