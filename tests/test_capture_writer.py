@@ -154,7 +154,15 @@ from tagjax.recording.capture.writing_thread import FilmingThread, WritingThread
 from pathlib import Path
 recording, start, progress = small_recording(20.0, frame_rate_hz=20.0), PlaybackStart(), Progress()
 reads = captured(recording)
-writing = WritingThread(lambda video: writer_of(recording, Path(sys.argv[1])), progress, commit_s=0.3)
+def make(video):
+    writer = writer_of(recording, Path(sys.argv[1]))
+    commit = writer.commit
+    def committed():
+        commit()
+        print("commit", writer.num_frames, writer.num_reads, time.monotonic(), flush=True)
+    writer.commit = committed
+    return writer
+writing = WritingThread(make, progress, commit_s=0.3)
 filming = FilmingThread(PlaybackCamera(recording, start), writing)
 start.begin()
 begun = time.monotonic()
@@ -162,7 +170,6 @@ for read in reads:
     while time.monotonic() - begun < (read.arrival_time_ns - reads[0].arrival_time_ns) * 1e-9:
         time.sleep(0.002)
     writing.put(dataclasses.replace(read, arrival_time_ns=HOST_CLOCK.now_ns()))
-    print(progress.num_frames, progress.num_reads, flush=True)
 """
 
 
@@ -173,20 +180,21 @@ def test_a_killed_process_loses_a_second_at_most(tmp_path: Path) -> None:
         [sys.executable, "-c", _CHILD, str(path)], stdout=subprocess.PIPE, text=True, env=environment
     )
     assert child.stdout is not None
-    line = ""
+    commits: list[tuple[int, int, float]] = []
     for line in child.stdout:
-        if int(line.split()[1]) > 900:  # two seconds
+        _, num_frames, num_reads, at_s = line.split()
+        commits.append((int(num_frames), int(num_reads), float(at_s)))
+        if int(num_reads) > 900:  # two seconds
             break
     os.kill(child.pid, signal.SIGKILL)
-    num_frames, num_reads = map(int, ([line, *child.stdout.read().splitlines()][-1]).split())
     child.stdout.close()
     child.wait()
     found = open_recording(path)
-    assert num_frames - found.num_frames <= 20
-    assert num_reads - found.reads.num_reads <= 450
-    assert found.reads.num_reads > 300
-    recording = small_recording(20.0, frame_rate_hz=20.0)
+    # The folder shows the last commit; commits come three times a second, on a busy machine once at least.
+    assert (found.num_frames, found.reads.num_reads) >= commits[-1][:2]
     assert found.num_frames > 10
+    assert np.median(np.diff([at_s for *_, at_s in commits])) < 1.0
+    recording = small_recording(20.0, frame_rate_hz=20.0)
     np.testing.assert_array_equal(np.asarray(found.colour), recording.colour[: found.num_frames])
     np.testing.assert_array_equal(found.reads.phase_rad, recording.reads.phase_rad[: found.reads.num_reads])
     finished = finish_recording(path)
