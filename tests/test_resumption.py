@@ -93,4 +93,4 @@ def test_commands_that_resume_are_those_that_say_so() -> None:
     """The others begin again; recordings that they have simulated, and cached flow, are there then."""
     root = Path(__file__).parents[1] / "experiments"
     found = {path.stem for path in root.glob("*.py") if "\n@resumable_command\n" in path.read_text()}
-    assert found == {"train", "train_flow", "simulate", "sweep_paper", "reproduce"}
+    assert found == {"train", "train_flow", "simulate", "sweep_paper", "reproduce", "paper"}
