@@ -77,7 +77,7 @@ def test_labels_teach_from_the_first_motion_on_and_only_what_is_seen() -> None:
     assert truth.labels is not None
     labels = np.array(truth.labels)
     labels[30:][labels[30:] == next(iter(EPCS.values()))] = 0  # out of the picture
-    began = {epc: first_motion(truth, epc, one.frame_time_s()) for epc in EPCS}
+    began = {epc: first_motion(truth, epc, one.frame_time_s()) or 0 for epc in EPCS}
     truth = dataclasses.replace(truth, labels=labels)
     (piece,) = segment_pieces(
         dataclasses.replace(one, truth=truth), TRACER, LOAD, epcs=list(EPCS), num_frames=64, teacher="labels"
@@ -118,6 +118,22 @@ def test_the_loss_is_that_of_the_masks(piece: Piece) -> None:
     loss, logged = SETTINGS.terms(TRACER, piece.camera, frames)
     np.testing.assert_allclose(loss["hindsight"], np.mean(missed) + np.mean(wrong), rtol=1e-4)
     np.testing.assert_allclose(logged["overlap"], 1 - np.mean(missed), rtol=1e-4)
+
+
+def test_the_mask_teaches_all_but_detection_and_the_confidence_detection_alone(piece: Piece) -> None:
+    learnable, static = eqx.partition(TRACER, eqx.is_inexact_array)
+
+    def sums(values: Any) -> Any:
+        found = hindsight_sums(eqx.combine(values, static), piece.camera, piece.frames, SETTINGS)
+        return jnp.stack([found.missed, found.wrong])
+
+    slopes = jax.jit(jax.jacrev(sums))(learnable)
+    detection = np.stack(jax.tree.leaves(slopes.detection))
+    others = eqx.tree_at(lambda one: one.detection, slopes, None)
+    assert np.all(detection[:, 0] == 0)
+    assert np.any(detection[:, 1] != 0)
+    assert all(np.all(leaf[1] == 0) for leaf in jax.tree.leaves(others))
+    assert any(np.any(leaf[0] != 0) for leaf in jax.tree.leaves(others))
 
 
 def test_padding_changes_nothing(piece: Piece) -> None:

@@ -47,7 +47,10 @@ def judged(value: float, limits: tuple[float, float]) -> Verdict:
 def worst_verdict(verdicts: list[Verdict]) -> Verdict:
     """The worst of several verdicts; what was not measured counts only where nothing was."""
     found: tuple[Verdict, ...] = ("bad", "limits", "good")
-    return next((one for one in found if one in verdicts), "not measured")
+    for one in found:
+        if one in verdicts:
+            return one
+    return "not measured"
 
 
 def worst(values: np.ndarray, limits: tuple[float, float]) -> int:

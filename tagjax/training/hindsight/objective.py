@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -12,7 +13,8 @@ from jaxtyping import Array, Float, PyTree
 
 from ...core.numerics import safe_divide
 from ...core.settings import ConfigError
-from ...tagattention.segments import TagAttention
+from ...tagattention.segments import Detection, TagAttention
+from ...tagattention.segments.detection import RecentReads
 from ...tracing.tracer import AbstractTracer, Camera
 from ..fading import faded
 from .pieces import PieceFrames, frame_of
@@ -74,6 +76,22 @@ class HindsightSums(NamedTuple):
     num_away: Float[Array, ""]
 
 
+class _Apart(eqx.Module):
+    """A detection, to whose inputs no gradient flows."""
+
+    stage: Detection
+
+    def received(self, state: RecentReads, arrivals: Any, added_nats: Array, *times_s: Array) -> RecentReads:
+        return self.stage.received(state, arrivals, jax.lax.stop_gradient(added_nats), *times_s)
+
+    def confidence(self, body_nats: Array, stationary_nats: Array, recent: RecentReads) -> Array:
+        nats = jax.lax.stop_gradient((body_nats, stationary_nats))
+        return self.stage.confidence(*nats, recent)
+
+    def __getattr__(self, name: str) -> Any:  # of the status, which has no gradient
+        return getattr(self.stage, name)
+
+
 def hindsight_sums(
     tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings
 ) -> HindsightSums:
@@ -81,8 +99,10 @@ def hindsight_sums(
 
     IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should say
     this IoU: its squared error is least where it is the IoU that is to be expected (a proper score; Brier, 1950), so that no
-    share of frames with and without an object makes it too sure. The IoU carries no gradient there.
+    share of frames with and without an object makes it too sure. The IoU carries no gradient there, nor does what detection
+    is given: so the mask teaches every stage but detection, and the confidence teaches detection alone.
     """
+    tracer = eqx.tree_at(lambda one: one.detection, tracer, replace_fn=_Apart)
     num_antennas, num_tags = camera.antennas_m.shape[0], frames.present.shape[1]
     window = frames.radio.relative_m.shape[-1]
 
