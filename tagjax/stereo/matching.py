@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 
 import cv2
@@ -19,6 +20,8 @@ MAX_DISPARITIES = 1024
 _SCALE = 16  # OpenCV's disparities have 4 fractional bits
 _STEP = 16  # the number of disparities is a multiple of it
 _MAX_MM = 65535
+_EDGE_PX = 1.5  # larger steps of disparity are edges of objects
+_LIKE_COLOUR = 12.0  # levels by which the same surface may differ
 _SLOPE = np.array([[-0.5, 0.0, 0.5]], np.float32)  # grey values a pixel, along a row
 _NOISE = np.float32(4.0)  # of the slope, squared: without it, windows without texture would follow the noise
 
@@ -34,11 +37,14 @@ class MatchSettings:
 
     near_m: float = 0.6
     far_m: float = 8.0
-    block_px: int = 5  # odd
+    block_px: int = 3  # odd
     smoothness: float = 1.0
     uniqueness_percent: int = 5  # by which the best match must be better than the second
     max_difference_px: float = 1.0
     min_patch_px: int = 60  # smaller patches of similar disparity are taken for errors, at a width of 512 pixels
+    border_px: int = (
+        9  # radius within which borders of near objects are compared with what has their colour; 0: they are not
+    )
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.near_m < self.far_m <= 1000:
@@ -51,9 +57,10 @@ class MatchSettings:
             raise ConfigError(
                 f"smoothness is {self.smoothness}, max_difference_px {self.max_difference_px}; expected values above 0."
             )
-        if not 0 <= self.uniqueness_percent < 100 or self.min_patch_px < 0:
+        if not 0 <= self.uniqueness_percent < 100 or self.min_patch_px < 0 or not 0 <= self.border_px <= 50:
             raise ConfigError(
-                f"uniqueness_percent is {self.uniqueness_percent}, min_patch_px {self.min_patch_px}; expected 0 to 99, and 0 or more."
+                f"uniqueness_percent is {self.uniqueness_percent}, min_patch_px {self.min_patch_px}, border_px {self.border_px}; expected "
+                "0 to 99, 0 or more, and 0 to 50."
             )
 
     def search_px(self, focal_px: float, baseline_m: float) -> tuple[int, int]:
@@ -93,7 +100,10 @@ def disparity_of_pair(
     mirrored = _matched(right[:, ::-1], left[:, ::-1], first, count, settings)
     found = _agreeing(from_left, mirrored[:, ::-1], settings.max_difference_px)
     patch_px = round(settings.min_patch_px * (left.shape[1] / 512) ** 2)
-    return _refined(left, right, _without_small_patches(found, patch_px), settings.block_px + 2)
+    found = _without_small_patches(found, patch_px)
+    if settings.border_px:
+        found = _without_widened_borders(left, found, settings.border_px)
+    return _refined(left, right, found, settings.block_px + 2)
 
 
 def depth_of_disparity(
@@ -154,6 +164,34 @@ def _agreeing(from_left: np.ndarray, from_right: np.ndarray, max_difference_px: 
     back = np.take_along_axis(from_right, at, axis=1)
     kept = inside & (np.abs(back - from_left) <= max_difference_px) & (from_left > 0)
     return np.where(kept, from_left, 0).astype(np.float32)
+
+
+def _without_widened_borders(
+    left: np.ndarray, disparity_px: np.ndarray, radius_px: int
+) -> Float[np.ndarray, "height width"]:
+    """Disparities without the seam of background that blocks of a near object's edge take for the object; 0 there.
+
+    A pixel beside something farther away keeps its disparity if, of the pixels around it that have its colour, those of its own
+    disparity outweigh those that are farther away (the vote of a bilateral filter).
+    """
+    height, width = disparity_px.shape
+    known = np.where(disparity_px > 0, disparity_px, np.float32(np.inf))
+    lowest = cv2.erode(known, np.ones((2 * radius_px + 1,) * 2, np.uint8))
+    row, column = np.nonzero((disparity_px > 0) & (disparity_px - lowest > _EDGE_PX))
+    own, colour = disparity_px[row, column], left[row, column].astype(np.float32)
+    same, farther = np.zeros(len(row), np.float32), np.zeros(len(row), np.float32)
+    reach = range(-radius_px, radius_px + 1, max(1, radius_px // 3))
+    for down, across in itertools.product(reach, reach):
+        at = np.clip(row + down, 0, height - 1), np.clip(column + across, 0, width - 1)
+        other = disparity_px[at]
+        differs = left[at].astype(np.float32) - colour
+        alike = np.exp(np.einsum("nc,nc->n", differs, differs) * np.float32(-0.5 / _LIKE_COLOUR**2)) * (other > 0)
+        same += alike * (np.abs(other - own) <= 1)
+        farther += alike * (own - other > _EDGE_PX)
+    out = disparity_px.copy()
+    drop = farther > same
+    out[row[drop], column[drop]] = 0
+    return out
 
 
 def _refined(
