@@ -23,11 +23,9 @@ def main(values: dict[str, Any], folder: Path) -> None:
     for side in ("left", "right"):
         if values[side] is None:
             raise ValueError(f"found no {side}; expected {side}=<folder of pictures of the checkerboard>.")
-    settings, console = (
-        checked(CalibrateStereoSettings, values, folder),
-        Console(soft_wrap=True, highlight=False, markup=False),
-    )
-    _, lines = calibrate_stereo_folders(settings)
+    progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
+    settings = checked(CalibrateStereoSettings, values, folder)
+    _, lines = calibrate_stereo_folders(settings, progress=progress)
     for line in (*lines, f"written to {settings.out}"):
         console.print(line, markup=False)
 

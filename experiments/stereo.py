@@ -21,8 +21,8 @@ def main(values: dict[str, Any], folder: Path) -> None:
 
     from tagjax.stereo.conversion import StereoSettings, stereo_recording
 
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    _, lines = stereo_recording(checked(StereoSettings, values, folder))
+    progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
+    _, lines = stereo_recording(checked(StereoSettings, values, folder), progress=progress)
     for line in lines:
         console.print(line, markup=False)
 

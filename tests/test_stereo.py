@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from checkerboards import draw_board
+from composed import composed
 
 from tagjax.baselines.tagvision import PlaneCamera
 from tagjax.core.geometry import project
-from tagjax.core.settings import ConfigError
+from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.image.checkerboard import Board, CalibrationError
 from tagjax.recording import Intrinsics, RecordingError
 from tagjax.recording.store import open_recording
@@ -220,9 +221,22 @@ def test_calibration_recovers_the_pair_from_corners() -> None:
         calibrate_pair(views[0][1:], views[1], board, 320, 240)
     with pytest.raises(CalibrationError, match="2 pictures show the board"):
         calibrate_pair(views[0][:2], views[1][:2], board, 320, 240)
-    across = model[:, ::-1].reshape(4, 6, 3).transpose(1, 0, 2).reshape(-1, 3)[:, :2] * 400 + 120
+    turn, shift = _boards(3)[2]
+    spin, middle = cv2.Rodrigues(np.array([0.0, 0.0, 1.2]))[0], model.mean(axis=0)
+    other = _projected((model - middle) @ spin.T + middle, RIG.left, turn, shift)
     with pytest.raises(CalibrationError, match="Pair 2: the board is turned by"):
-        calibrate_pair(views[0], [*views[1][:2], across[:, ::-1], *views[1][3:]], board, 320, 240)
+        calibrate_pair(views[0], [*views[1][:2], other, *views[1][3:]], board, 320, 240)
+
+
+def test_the_commands_configurations_are_those_of_the_library() -> None:
+    for name, schema, given in (
+        ("stereo", StereoSettings, {"recording": "a.zarr"}),
+        ("calibrate_stereo", CalibrateStereoSettings, {"left": "a", "right": "b"}),
+    ):
+        values = {**composed(name), **given}
+        assert values.pop("progress") is True
+        values.pop("paths", None)
+        assert from_mapping(schema, values) == schema(**given)
 
 
 @pytest.mark.ci

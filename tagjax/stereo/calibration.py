@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import RecordingError
+from ..core.progress import tracked
 from ..image.checkerboard import Board, CalibrationError, CameraCalibration, calibrate, check_corners, find_corners
 from ..recording.image_files import natural_sorted, read_colour
 from .rectification import rectify, row_difference_px
@@ -145,7 +146,9 @@ class CalibrateStereoSettings:
     num_radial: int = 2
 
 
-def calibrate_stereo_folders(settings: CalibrateStereoSettings) -> tuple[StereoCalibration, list[str]]:
+def calibrate_stereo_folders(
+    settings: CalibrateStereoSettings, *, progress: bool = False
+) -> tuple[StereoCalibration, list[str]]:
     """Calibrate from two folders, write the camera file, and report line by line.
 
     Pictures are paired in natural order of their names. Raises `CalibrationError` for folders that cannot be used, and errors
@@ -159,7 +162,7 @@ def calibrate_stereo_folders(settings: CalibrateStereoSettings) -> tuple[StereoC
         )
     views: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     without, shape = [], None
-    for pair in zip(*files, strict=True):
+    for pair in tracked(zip(*files, strict=True), "find the board", len(files[0]), shown=progress):
         pictures = [_read(path) for path in pair]
         for path, picture in zip(pair, pictures, strict=True):
             shape = shape or picture.shape[:2]

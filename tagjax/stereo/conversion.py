@@ -65,7 +65,7 @@ class StereoSettings:
             raise ConfigError(f"fps is {self.fps}; expected a frame rate above 0 and at most 1000.")
 
 
-def stereo_recording(settings: StereoSettings) -> tuple[Recording, list[str]]:
+def stereo_recording(settings: StereoSettings, *, progress: bool = False) -> tuple[Recording, list[str]]:
     """The recording, checked, and saved if `settings.out` is given; and a report, line by line.
 
     Colour is the rectified left picture, depth its disparity to the right one. Both are computed when they are read. Raises
@@ -106,7 +106,7 @@ def stereo_recording(settings: StereoSettings) -> tuple[Recording, list[str]]:
         f"{len(recording.reads.epcs)} tags"
     )
     if settings.out is not None:
-        save_recording(recording, settings.out, progress=True)
+        save_recording(recording, settings.out, progress=progress)
         lines.append(f"saved as {settings.out}")
     return recording, lines
 
