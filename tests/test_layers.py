@@ -18,7 +18,7 @@ LAYERS = (
     {"core"},
     {"image", "radio"},
     {"recording"},
-    {"flow", "sim"},
+    {"flow", "sim", "stereo"},
     {"tracing"},
     {"tagattention", "metrics"},
     {"report"},

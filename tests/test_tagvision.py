@@ -16,7 +16,6 @@ from composed import composed
 
 from tagjax.baselines.reads import hop_slope_rad_hz, range_phase_rad
 from tagjax.baselines.tagvision import TagVisionSettings
-from tagjax.baselines.tagvision.calibration import Board
 from tagjax.baselines.tagvision.detection import BlobSettings
 from tagjax.baselines.tagvision.experiment import TagVisionExperiment, run_tagvision
 from tagjax.baselines.tagvision.experiment.lines import LineSettings, line_scores
@@ -33,6 +32,7 @@ from tagjax.baselines.tagvision.phase_score import (
 from tagjax.baselines.tagvision.picture_folder import CalibrateSettings
 from tagjax.baselines.tagvision.tracks import TrackSettings
 from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.image.checkerboard import Board
 
 C = 299_792_458.0
 SIGMA = 0.1 * np.sqrt(2.0)

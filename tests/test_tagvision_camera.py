@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import subprocess
 import sys
@@ -12,9 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from checkerboards import draw_board
 
 from tagjax.baselines.tagvision import PlaneCamera, load_calibration, save_calibration
-from tagjax.baselines.tagvision.calibration import Board, CalibrationError, calibrate, camera_pose, find_corners
+from tagjax.baselines.tagvision.calibration import camera_pose
 from tagjax.baselines.tagvision.experiment.simulated_calibration import (
     PAPER_CAMERA,
     CalibrationSettings,
@@ -31,6 +31,7 @@ from tagjax.baselines.tagvision.picture_folder import (
     write_calibration,
     write_corners,
 )
+from tagjax.image.checkerboard import Board, CalibrationError, calibrate, find_corners
 from tagjax.recording import Intrinsics
 
 ROOT = Path(__file__).parents[1]
@@ -132,23 +133,6 @@ def test_calibration_refuses_unusable_views() -> None:
         camera_pose(points * [1.0, -1.0, 1.0], seen, PAPER_CAMERA)
 
 
-def _draw_board(camera: PlaneCamera, board: Board, rng: np.random.Generator, origin_m=(0.0, 0.0)) -> np.ndarray:
-    """A picture of the board on the plane z = 0, by looking up the square that every (quarter) pixel sees."""
-    k = camera.intrinsics
-    steps = np.array([-1 / 3, 0.0, 1 / 3])
-    total = np.zeros((k.height, k.width))
-    x, y = np.meshgrid(np.arange(k.width, dtype=float), np.arange(k.height, dtype=float))
-    for dx, dy in itertools.product(steps, steps):
-        place = camera.to_plane(np.stack([x + dx, y + dy], axis=-1).reshape(-1, 2))
-        column = np.floor((place[:, 0] - origin_m[0]) / board.square_m + 1)
-        row = np.floor(-(place[:, 1] - origin_m[1]) / board.square_m + 1)
-        inside = (column >= 0) & (column < board.columns) & (row >= 0) & (row < board.rows)
-        light = np.where(inside, np.where((column + row) % 2 == 0, 30.0, 220.0), 220.0)
-        total += light.reshape(total.shape) / 9
-    grey = np.clip(total + rng.normal(0, 2.0, total.shape), 0, 255)
-    return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=-1)
-
-
 SMALL_CAMERA = Intrinsics(400.0, 400.0, 159.5, 119.5, 320, 240, (-0.15, 0.05, 0.0, 0.0, 0.0))
 
 
@@ -165,7 +149,7 @@ def test_corners_of_a_drawn_board_are_found_to_a_tenth_of_a_pixel() -> None:
     rng, board, errors = np.random.default_rng(10), Board(), []
     for seed in range(3):
         camera = _held(seed)
-        found = find_corners(_draw_board(camera, board, rng), board)
+        found = find_corners(draw_board(camera, board, rng), board)
         assert found is not None
         true = camera.to_picture(board.corners_m())
         # A board of odd sides looks the same from either end.
@@ -181,12 +165,12 @@ def test_a_folder_of_pictures_is_calibrated(tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     folder.mkdir()
     for seed in range(6):
-        cv2.imwrite(str(folder / f"{seed}.png"), _draw_board(_held(seed), board, rng))
+        cv2.imwrite(str(folder / f"{seed}.png"), draw_board(_held(seed), board, rng))
     cv2.imwrite(str(folder / "empty.png"), np.full((240, 320, 3), 200, np.uint8))
     above = overhead(SMALL_CAMERA, (0.15, -0.1, 0.9))
     poses = []
     for number, origin in enumerate([(0.0, 0.0), (0.12, -0.06)]):
-        cv2.imwrite(str(tmp_path / f"table{number}.png"), _draw_board(above, board, rng, origin))
+        cv2.imwrite(str(tmp_path / f"table{number}.png"), draw_board(above, board, rng, origin))
         poses.append(PosePicture(str(tmp_path / f"table{number}.png"), origin))
     found = calibrate_folder(CalibrateSettings(str(folder), poses=tuple(poses)))
     assert found.without_board == ("empty.png",)
@@ -229,7 +213,7 @@ def test_a_folder_of_pictures_is_calibrated(tmp_path: Path) -> None:
 def test_the_command_reports_the_result_or_the_error(tmp_path: Path) -> None:
     rng, run = np.random.default_rng(12), [sys.executable, "-m", "experiments.calibrate_camera"]
     for seed in range(4):
-        cv2.imwrite(str(tmp_path / f"{seed}.png"), _draw_board(_held(seed), Board(), rng))
+        cv2.imwrite(str(tmp_path / f"{seed}.png"), draw_board(_held(seed), Board(), rng))
     given = [f"pictures={tmp_path}", f"out={tmp_path / 'new' / 'camera.json'}", f"hydra.run.dir={tmp_path / 'run'}"]
     done = subprocess.run([*run, *given], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr

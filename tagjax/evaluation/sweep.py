@@ -169,7 +169,7 @@ def _caching_loader(clips: ClipSettings) -> Callable[..., Any]:
 
 
 def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, Value]) -> str:
-    scene = {**dataclasses.asdict(suite), "counts": None}  # the number of other recordings has no influence
+    scene = {**suite.as_dict(), "counts": None}  # the number of other recordings has no influence
     width, clips = suite.capture.intrinsics().width, config.clip_settings()
     parts = [
         scene,

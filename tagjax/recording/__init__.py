@@ -7,4 +7,5 @@ from .reads import TagReads as TagReads
 from .recording import ClockAudit as ClockAudit
 from .recording import ClockPiece as ClockPiece
 from .recording import Recording as Recording
+from .recording import SecondCamera as SecondCamera
 from .recording import Truth as Truth

@@ -65,6 +65,24 @@ def check_geometry(recording: Recording) -> None:
         )
 
 
+def check_second(recording: Recording, min_m: float, max_m: float) -> None:
+    """Raise `RecordingError` for a second camera with other pictures than the first, or no plausible baseline."""
+    second, name = recording.second, recording.name
+    if second is None:
+        return
+    if second.colour.shape != recording.colour.shape or second.colour.dtype != np.uint8:
+        raise RecordingError(
+            f"{name}: the second camera's colour is {second.colour.dtype} of shape {second.colour.shape}; expected uint8 of shape "
+            f"{recording.colour.shape}, as the first camera's."
+        )
+    baseline = second.baseline_m
+    if isinstance(baseline, bool) or not isinstance(baseline, int | float) or not min_m <= baseline <= max_m:
+        raise RecordingError(
+            f"{name}: the second camera's baseline_m is {baseline!r}; expected {min_m:g} to {max_m:g} m to the right of the first. "
+            "Millimetres must be converted; where it is on the left, exchange the two cameras."
+        )
+
+
 def check_time_of_reads(recording: Recording) -> None:
     """Raise `RecordingError` if most reads lie outside of the video's time; warn if some do."""
     reads, time_ns = recording.reads, recording.time_ns

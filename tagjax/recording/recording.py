@@ -16,11 +16,25 @@ import numpy as np
 from ..core.camera import Intrinsics
 from ..core.errors import RecordingError, RecordingWarning
 from ..core.types import LazyArray
-from .checks import check_geometry, check_names, check_time_of_reads, check_truth
+from .checks import check_geometry, check_names, check_second, check_time_of_reads, check_truth
 from .reads import TagReads
 
 MAX_RANGE_M = 30.0
 """A median depth above this is taken for a wrong unit: no RGB-D camera of this kind measures so far."""
+
+
+MIN_BASELINE_M, MAX_BASELINE_M = 0.005, 2.0
+"""Distances between two cameras that a recording may have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SecondCamera:
+    """Pictures of a colour camera beside the first, at the same times. The pair is rectified: the second camera has the
+    first one's intrinsics and orientation, and is `baseline_m` to its right.
+    """
+
+    colour: LazyArray  # (num_frames, height, width, 3) uint8 RGB
+    baseline_m: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +106,7 @@ class Recording:
     name: str = "recording"
     source: str = ""  # data and settings that it was made from
     store: Any = None  # the open Zarr group, for a stored recording
+    second: SecondCamera | None = None  # another colour camera, where the recording has one
     reversed_from: Recording | None = None  # the original of a time-reversed recording
 
     @property
@@ -165,6 +180,7 @@ class Recording:
                 "expected strictly increasing times. Drop or re-stamp the frame."
             )
         check_geometry(self)
+        check_second(self, MIN_BASELINE_M, MAX_BASELINE_M)
         if self.truth is not None:
             check_truth(self.truth, self.name, num_frames, shape)
         if depth:

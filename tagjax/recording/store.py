@@ -18,7 +18,7 @@ from ..core.files import atomic_path
 from ..core.progress import tracked
 from ..core.types import LazyArray
 from .reads import TagReads
-from .recording import ClockAudit, ClockPiece, Recording, Truth
+from .recording import ClockAudit, ClockPiece, Recording, SecondCamera, Truth
 from .stored_frames import StoredFrames, create_array, num_chunks_present
 
 FORMAT = "tagjax-recording"
@@ -32,6 +32,7 @@ UNFINISHED = "unfinished"
 
 _TRUTH_ARRAYS = ("labels", "flow_px", "occluded", "backward_flow_px", "backward_occluded")
 _TRUTH_TABLES = ("tag_range_m", "tag_position_m", "visible", "line_of_sight", "carrier_box_px")
+_SECOND = "second/colour"
 READ_SETTINGS = ("hop_table_hz", "phase_period_rad", "phase_sign", "pi_flips")
 READ_COLUMNS = tuple(field.name for field in dataclasses.fields(TagReads) if field.name not in READ_SETTINGS)
 
@@ -107,6 +108,9 @@ def _parts(recording: Recording) -> tuple[dict[str, LazyArray], dict[str, np.nda
         "num_reads": reads.num_reads,
         "truth": None,
     }
+    if recording.second is not None:
+        frames[_SECOND] = recording.second.colour
+        attributes["second"] = {"baseline_m": recording.second.baseline_m}
     if truth is not None:
         frames |= {f"truth/{name}": array for name in _TRUTH_ARRAYS if (array := getattr(truth, name)) is not None}
         if truth.boxes_px is not None:
@@ -239,6 +243,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
     for text in ("name", "source"):
         if not isinstance(attributes[text], str):
             raise RecordingError(f"{path}: {text} is {attributes[text]!r}; expected a text. Copy or import it again.")
+    second = attributes.get("second")  # only a recording of two cameras has it
     intrinsics = dict(attributes["intrinsics"])
     intrinsics["distortion"] = tuple(intrinsics["distortion"])
     return Recording(
@@ -254,6 +259,7 @@ def _read(root: zarr.Group, attributes: dict[str, Any], path: str, writable: boo
         name=attributes["name"],
         source=attributes["source"],
         store=root if writable and not attributes.get(UNFINISHED) else None,
+        second=None if second is None else SecondCamera(array(_SECOND), second["baseline_m"]),
     )
 
 

@@ -67,5 +67,6 @@ def time_reversed(recording: Recording) -> Recording:
         truth=Truth(tag_range_m=ranges) if ranges else None,
         clock=None,
         store=None,
+        second=None,
         reversed_from=recording,
     )

@@ -6,19 +6,20 @@ Ray casting, and with it MuJoCo (the `sim` extra), is imported when the first re
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..recording import ClockAudit, Intrinsics, Recording, RecordingError, TagReads, Truth
+from ..recording import ClockAudit, Intrinsics, Recording, RecordingError, SecondCamera, TagReads, Truth
 from ..recording.importers.clock import to_host_clock
+from ..recording.recording import MAX_BASELINE_M, MIN_BASELINE_M
 from .propagation import propagation
 from .radio.inventory import simulate_inventory
-from .rendering.exact_flow import flow_between
+from .rendering.exact_flow import FlowTruth, flow_between
 from .rendering.exposure import ILLUMINATION, auto_exposure
 from .rendering.hits import Hits
 from .rendering.sensors import SENSORS, frame_times, kinect_v2_intrinsics, xtion_intrinsics
-from .rendering.viewpoint import Viewpoint, look_at
+from .rendering.viewpoint import Viewpoint, look_at, moved_right
 from .stories.scenario import Scenario
 from .world.bodies import STEP_S, World, tag_path
 
@@ -36,6 +37,9 @@ class CaptureSettings:
     shutter_s: float = 0.0  # exposure time that causes motion blur; 0 = none
     shadows: bool = True
     flow: bool = False  # exact forward and backward flow with occlusion in the truth
+    # Of a second colour camera to the right of the first, rectified, with the same intrinsics; None: one camera. It is left
+    # out of texts that describe a recording of one camera: those stay what they were.
+    stereo_baseline_m: float | None = dataclasses.field(default=None, repr=False)
 
     def __post_init__(self):
         if self.sensor not in SENSORS:
@@ -49,6 +53,16 @@ class CaptureSettings:
                 f"frame_rate_hz is {self.frame_rate_hz} and shutter_s {self.shutter_s}; expected a positive rate and a "
                 "shutter time of at least 0."
             )
+        if self.stereo_baseline_m is not None and not MIN_BASELINE_M <= self.stereo_baseline_m <= MAX_BASELINE_M:
+            raise ValueError(
+                f"stereo_baseline_m is {self.stereo_baseline_m}; expected {MIN_BASELINE_M:g} to {MAX_BASELINE_M:g} m between the "
+                "cameras, or null for one camera."
+            )
+
+    def __str__(self) -> str:
+        """The settings as a text; the second camera is named only where there is one."""
+        second = "" if self.stereo_baseline_m is None else f", stereo_baseline_m={self.stereo_baseline_m}"
+        return f"{repr(self)[:-1]}{second})"
 
     def intrinsics(self) -> Intrinsics:
         """The sensor's camera at the chosen width."""
@@ -82,7 +96,9 @@ def simulate_recording(
     steps = np.minimum(times / STEP_S, world.num_steps - 1)
     view = look_at(capture.intrinsics(), scenario.camera_position_m, scenario.camera_look_at_m)
     people, person_of_body = carriers(world)
-    frames, flow = _render(world, view, capture, steps, rng, on_frame, person_of_body)
+    frames, flow = _render(
+        world, view, capture, steps, rng, on_frame, person_of_body, second_rng=np.random.default_rng([seed, 2, 1])
+    )
     reads, clock, sight = _read_tags(scenario, seed)
     antennas = view.to_camera(np.asarray(scenario.antennas_m, float))
     position = {tag.epc: _at_steps(view.to_camera(tag_path(world, tag)), steps) for tag in world.tags}
@@ -112,6 +128,9 @@ def simulate_recording(
             line_of_sight={epc: _at_steps(kept[:, None], steps)[:, 0] for epc, kept in sight.items()},
             **flow,
         ),
+        second=None
+        if "second" not in frames
+        else SecondCamera(frames["second"], float(capture.stereo_baseline_m or 0)),
         name=name,
         source=f"simulated: {world.note or name}, seed {seed}, {capture}",
     )
@@ -125,29 +144,36 @@ def _render(
     rng: np.random.Generator,
     on_frame: Callable[[], None] | None,
     person_of_body: np.ndarray,
+    second_rng: np.random.Generator,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Colour, depth, labels and carriers of every frame, and the fields of `Truth` that hold exact flow (none unless asked for).
 
-    Carriers are pictures of `person_of_body` at the body that each pixel shows.
+    Carriers are pictures of `person_of_body` at the body that each pixel shows. A second camera has noise of its own
+    (`second_rng`), so that the pictures of the first do not depend on it.
     """
     from .rendering.raycast import Raycaster
-    from .rendering.shading import Shader
+    from .rendering.shading import Shader, Surface
 
     raycaster = Raycaster(world)
     shader, sensor, lamp = Shader(raycaster), SENSORS[capture.sensor], ILLUMINATION[capture.illumination]
     frames: dict[str, list[np.ndarray]] = {"colour": [], "depth": [], "labels": [], "carriers": []}
     flows = []
+    second = None if capture.stereo_baseline_m is None else moved_right(view, capture.stereo_baseline_m)
+    if second is not None:
+        frames["second"] = []
+
+    def light_of(hits: Hits, surface: Surface | None, step: float) -> np.ndarray:
+        if capture.shutter_s > 0:
+            return shader.blurred(hits.view, step, capture.shutter_s / STEP_S, shadows=capture.shadows)
+        return shader.radiance(hits, surface, shadows=capture.shadows)
+
     previous: Hits | None = None
     exposure = 0.0
     for step in steps:
         raycaster.pose(step)
         hits = raycaster.cast(view)
         surface = shader.surface(hits)
-        light = (
-            shader.blurred(view, step, capture.shutter_s / STEP_S, shadows=capture.shadows)
-            if capture.shutter_s > 0
-            else shader.radiance(hits, surface, shadows=capture.shadows)
-        )
+        light = light_of(hits, surface, step)
         exposure = exposure or auto_exposure(light)
         frames["colour"].append(lamp.expose(light, rng, exposure=exposure))
         frames["depth"].append(sensor.measure(hits, surface.reflectance, surface.shine, rng))
@@ -157,15 +183,21 @@ def _render(
         if capture.flow and previous is not None:
             flows.append(flow_between(previous, hits))
         previous = hits
+        if second is not None:
+            seen = light_of(raycaster.cast(second), None, step)
+            frames["second"].append(lamp.expose(seen, second_rng, exposure=exposure))
         if on_frame is not None:
             on_frame()
     pictures = {key: np.stack(values) for key, values in frames.items()}
     if not capture.flow:
         return pictures, {}
-    # There is no flow from the last frame on, nor back from the first.
-    shape = (view.intrinsics.height, view.intrinsics.width)
+    return pictures, _flow_fields(flows, (view.intrinsics.height, view.intrinsics.width))
+
+
+def _flow_fields(flows: Sequence[FlowTruth], shape: tuple[int, int]) -> dict[str, np.ndarray]:
+    """The fields of `Truth` that hold exact flow: there is none from the last frame on, nor back from the first."""
     missing, nothing = np.full((*shape, 2), np.nan, np.float32), np.zeros(shape, bool)
-    return pictures, {
+    return {
         "flow_px": np.stack([*(flow.forward_px for flow in flows), missing]),
         "occluded": np.stack([*(flow.forward_occluded for flow in flows), nothing]),
         "backward_flow_px": np.stack([missing, *(flow.backward_px for flow in flows)]),

@@ -103,6 +103,13 @@ class Suite:
         if len(set(names)) != len(names):
             raise ValueError(f"{self.name}: variants are named {', '.join(names)}; expected different names.")
 
+    def as_dict(self) -> dict[str, Any]:
+        """The settings as plain values. A second camera is left out where there is none: such a suite's stay what they were."""
+        values = dataclasses.asdict(self)
+        if self.capture.stereo_baseline_m is None:
+            del values["capture"]["stereo_baseline_m"]
+        return values
+
     def smoke(self) -> Suite:
         """The suite in small, for tests: pictures 64 pixels wide, `smoke_s` long, one test recording per variant."""
         capture = dataclasses.replace(self.capture, width=64, frame_rate_hz=min(self.capture.frame_rate_hz, 5.0))
@@ -206,7 +213,7 @@ def prepare(suite: Suite, folder: Path) -> list[Item]:
     else or the suite with other settings. The caller holds the suite's lock.
     """
     home = folder / suite.name
-    manifest = json.loads(json.dumps({"version": _VERSION, **dataclasses.asdict(suite)}))
+    manifest = json.loads(json.dumps({"version": _VERSION, **suite.as_dict()}))
     if home.exists() and not all(path.name.startswith(".") for path in home.iterdir()):
         try:
             found = parse_json((home / MANIFEST).read_bytes())

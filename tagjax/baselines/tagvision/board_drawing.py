@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from .calibration import Board
+from ...image.checkerboard import Board
 from .plane import PlaneCamera
 
 Colour = tuple[int, int, int]

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ...core.progress import OnProgress, unobserved
+from ...image.checkerboard import Board, CalibrationError, CameraCalibration, calibrate, find_corners
 from ...recording.image_files import write_image
 from .board_drawing import LocatedBoard, draw_boards
-from .calibration import Board, CalibrationError, CameraCalibration, calibrate, camera_pose, find_corners
+from .calibration import camera_pose
 from .plane import PlaneCamera, save_calibration
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")

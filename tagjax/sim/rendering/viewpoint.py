@@ -42,6 +42,11 @@ def look_at(
     return Viewpoint(intrinsics, position, np.stack([right, np.cross(forward, right), forward], axis=1))
 
 
+def moved_right(view: Viewpoint, distance_m: float) -> Viewpoint:
+    """The same camera, moved along its own x axis."""
+    return Viewpoint(view.intrinsics, view.position_m + distance_m * view.rotation[:, 0], view.rotation)
+
+
 def view_key(view: Viewpoint) -> tuple[Intrinsics, bytes, bytes]:
     """A dictionary key that identifies a viewpoint."""
     return view.intrinsics, view.position_m.tobytes(), view.rotation.tobytes()

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from ....image.checkerboard import Board, calibrate
 from ....recording import Intrinsics
-from ..calibration import Board, calibrate, camera_pose
+from ..calibration import camera_pose
 from ..plane import PlaneCamera
 
 PAPER_CAMERA = Intrinsics(1000.0, 1000.0, 639.5, 359.5, 1280, 720, (-0.12, 0.05, 0.0, 0.0, 0.0))
