@@ -155,8 +155,19 @@ def test_packaged_parameters_need_no_further_setting(tmp_path: Path, monkeypatch
     assert ClipSettings().stride is None  # without weights: as the camera has it
 
 
-def test_there_are_no_packaged_parameters_yet() -> None:
-    assert packaged_parameters() == ()
+def test_the_packaged_parameters_are_of_the_tracer_as_it_is() -> None:
+    assert packaged_parameters() == ("default",)
+    tracer, clips = learned_tracer("default")
+    assert isinstance(tracer, TagAttention)
+    assert clips == ClipSettings()
+    learned, untrained = tracer.physical(), TagAttention().physical()
+    assert learned.keys() == untrained.keys()
+    assert sum(learned[name] != pytest.approx(untrained[name], rel=1e-3) for name in learned) > 10
+    assert all(np.isfinite(value) for value in learned.values())
+
+
+def test_without_packaged_parameters_the_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tagjax.tagattention.learned.PACKAGED", tmp_path)
     with pytest.raises(ValueError, match=r"weights=default: no packaged parameters .* \(packaged are: none\)"):
         learned_tracer("default")
 

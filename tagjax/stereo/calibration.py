@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -91,9 +92,10 @@ def calibrate_pair(
     if num_radial == 0:
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     first, second = (one.intrinsics for one in alone)
+    fit: Any = cv2.stereoCalibrate  # its stubs have no overload with a flag and criteria
     pictured = [[np.asarray(view, np.float32).reshape(-1, 1, 2) for view in views] for views in (left_px, right_px)]
     try:
-        rms, matrix_left, lens_left, matrix_right, lens_right, rotation, shift, *_ = cv2.stereoCalibrate(
+        rms, matrix_left, lens_left, matrix_right, lens_right, rotation, shift, *_ = fit(
             [model.astype(np.float32)] * len(left_px), *pictured,
             first.matrix(), np.array(first.distortion), second.matrix(), np.array(second.distortion), (width, height),
             flags=flags, criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9),

@@ -210,7 +210,8 @@ def _refined(
     slope = cv2.filter2D(other, -1, _SLOPE, borderType=cv2.BORDER_REPLICATE)
     known = (disparity_px > 0).astype(np.float32)
     count = np.maximum(_box(known, window_px), np.float32(1e-3))
-    y, x = np.indices(disparity_px.shape, np.float32)
+    grid = np.indices(disparity_px.shape, np.float32)
+    y, x = grid[0], grid[1]
     found = disparity_px.copy()
     for _ in range(2):
         seen = cv2.remap(other, x - found, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
