@@ -137,6 +137,7 @@ def _traces(one: Recording, smooth: bool, **settings: int) -> list[Trace]:
     return [out for _, out in trace_recording(TRACER, one, load, epcs=list(EPCS), settings=chosen)]
 
 
+@pytest.mark.ci
 def test_offline_finds_a_tag_before_its_first_motion_and_read():
     one = _late()
     online, offline = _traces(one, False), _traces(one, True, frames_at_once=17)

@@ -70,6 +70,7 @@ def test_targets_are_the_smoothers_masks(piece: Piece) -> None:
     assert np.all(np.diff(frames.time_s) > 0)
 
 
+@pytest.mark.ci
 def test_labels_teach_from_the_first_motion_on_and_only_what_is_seen() -> None:
     one = scene(40)
     truth = one.truth
@@ -142,6 +143,7 @@ def test_padding_changes_nothing(piece: Piece) -> None:
     np.testing.assert_allclose(whole, alone, rtol=1e-5)
 
 
+@pytest.mark.ci
 def test_a_step_against_the_gradient_lowers_the_loss(piece: Piece) -> None:
     gradient, logged = clip_gradient(TRACER, piece.camera, piece.frames, KEY, SETTINGS)
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(gradient)]
