@@ -39,7 +39,7 @@ def phase_unwrapping(sources: Sources, items: list[Item], path: Path) -> str:
         "smoothed by slots": np.asarray(unwrap_slots(reads))[valid],
     }
     part = (read_s >= begin_s) & (read_s <= begin_s + _SHOWN_S)
-    frame_s, truth_m = recording.frame_time_s(), _true_change_m(recording, epc, read_s[part][0])
+    frame_s, truth_m = recording.frame_time_s(), _true_change_m(recording, epc, float(read_s[part][0]))
     shown = (frame_s >= read_s[part][0]) & (frame_s <= read_s[part][-1])
     scale = 4 * np.pi * np.asarray(reads.carrier_hz)[valid] / SPEED_OF_LIGHT_M_S
     phase = np.asarray(reads.phase_rad)[valid]

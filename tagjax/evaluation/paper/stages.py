@@ -212,12 +212,18 @@ def propagation(sources: Sources, items: list[Item], path: Path) -> str:
     names = ("attention_on", "attention_off", "carried_on", "carried_off", "likelihood_on", "likelihood_off")
     _write_numbers(scene, path, names)
     late = [one for one in scene.numbers if one.since_motion >= SETTLED and one.moves]
-    means = {name: float(np.nanmean([getattr(one, name) for one in late] or [np.nan])) for name in names}
+    means = {name: _mean_known([getattr(one, name) for one in late]) for name in names}
     return (
         f"{scene.where(wanted[0])}, and every {_APART}th after it. Mean of the moving frames from the {SETTLED}th on: attention "
         f"{means['attention_on']:.2f} on the object and {means['attention_off']:.2f} elsewhere, likelihood "
         f"{means['likelihood_on']:.2f} and {means['likelihood_off']:.4f}."
     )
+
+
+def _mean_known(values: list[float]) -> float:
+    """The mean of the values that are known; NaN where none is."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
 
 
 def distribution(sources: Sources, items: list[Item], path: Path) -> str:
@@ -231,7 +237,7 @@ def distribution(sources: Sources, items: list[Item], path: Path) -> str:
     columns = (at, *(maps.below(part, at) for part in (values, values[on_object], values[~on_object])))
     rows = ([f"{float(v):.6g}" for v in row] for row in zip(*columns, strict=True))
     write_csv(path.with_suffix(".csv"), ("level", "all", "object", "elsewhere"), rows)
-    kept = [100 * float(np.mean(values[on_object] >= level)) for level in (scene.cut, corners[-1])]
+    kept = [100 * _mean_known(list(1.0 * (values[on_object] >= level))) for level in (scene.cut, corners[-1])]
     return (
         f"{scene.where(frame)}. {kept[0]:.0f} % of the object's pixels are above the cut; {kept[1]:.0f} % would be above the last "
         f"corner, p = {corners[-1]:.2f}."
@@ -248,9 +254,7 @@ def refinement(sources: Sources, items: list[Item], path: Path) -> str:
     maps.refinement_figure(path, scene.colour(frame), stages.cluster, stages.cut, stages.mask, true_mask, texts, crop)
     _write_numbers(scene, path, ("iou_before", "iou_after"))
     late = [one for one in scene.numbers if one.since_motion >= SETTLED]
-    before, after = (
-        float(np.nanmean([getattr(one, name) for one in late] or [np.nan])) for name in ("iou_before", "iou_after")
-    )
+    before, after = (_mean_known([getattr(one, name) for one in late]) for name in ("iou_before", "iou_after"))
     return (
         f"{scene.where(frame)}. Mask IoU, mean from frame {SETTLED} to {LAST} after the first motion: {before:.2f} before, "
         f"{after:.2f} after."

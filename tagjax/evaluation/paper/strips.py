@@ -194,8 +194,8 @@ def _fall(traced: Traced) -> tuple[float, int]:
 
 def _identified(traced: Traced) -> float:
     own = [one.detected & (one.identified == one.label) for one in traced.frames.values()]
-    valid = [one.valid for one in traced.frames.values()]
-    return float(np.mean(np.concatenate(own)[np.concatenate(valid)]))
+    counted = np.concatenate(own)[np.concatenate([one.valid for one in traced.frames.values()])]
+    return float(np.mean(counted)) if len(counted) else float("nan")
 
 
 def _around_blockage(recording: Recording, epc: str) -> tuple[list[int], list[str]]:
