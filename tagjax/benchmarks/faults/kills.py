@@ -27,7 +27,7 @@ from .run_contents import DAMAGED, recording_contents, run_contents
 _SETTINGS = {
     "train": (
         # The smallest to compile that learns.
-        *("tracer=tagattention_literal", "tracer.cell=4", "tracer.softness=0.3", "~baselines"),
+        *("experiment=clips", "tracer=tagattention_literal", "tracer.cell=4", "tracer.softness=0.3", "~baselines"),
         *("data.clips.stride=2", "data.clips.length=6", "data.clips.estimator=literal", "data.clips.min_motion=0"),
         *("objective.span_frames=4", "objective.skip_frames=2", "objective.max_reads=64", "objective.num_channels=4"),
         *("loop.num_steps=24", "loop.batch_size=2", "loop.checkpoint_every=4", "loop.progress=false"),
