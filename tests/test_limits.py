@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -105,7 +106,9 @@ def test_no_read_at_all() -> None:
     limits = find_limits(faultless().with_reads(TagReads.empty()))
     assert limits.verdicts()["read_rate"] == limits.verdicts()["gaps"] == "bad"
     assert "no tag was read" in check_text(limits)
-    assert "</html>" in check_html(limits)
+    page = check_html(limits)
+    assert "</html>" in page
+    assert set(re.findall(r"var\((--\w+)\)", page)) <= set(re.findall(r"(--\w+):", page))  # every colour is there
 
 
 def test_the_worst_tag_is_named_and_strays_can_be_left_out() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from string import Template
 
 import numpy as np
 
@@ -13,7 +12,8 @@ from ..recording.limits.tags import TagLimits
 from .overlay import short_name
 from .page.charts import Line as Curve
 from .page.charts import line_chart
-from .page.html import Html, element, escaped, table, together
+from .page.document import document
+from .page.html import Html, element, table, together
 
 CHECK_PAGE = "check.html"
 """File name of the page, in the run folder."""
@@ -35,24 +35,6 @@ _STYLE = """
   .lines tbody th { font-weight: 600; }
 }
 """
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
-<title>$title</title>
-<link rel="icon" href="data:,">
-<style>
-$style</style>
-</head>
-<body>
-<header><h1>$title</h1></header>
-<main>$body</main>
-</body>
-</html>
-""")
 _BIN_S = 0.5
 _MAX_TAGS = 8
 _MAX_BINS = 300
@@ -86,6 +68,7 @@ def write_check_page(limits: Limits, path: Path) -> Path:
 
 def check_html(limits: Limits) -> str:
     """The page's HTML: the lines, the tags, and charts over time."""
+    title = f"Check of {limits.name}"
     body = together(
         element("p", _about(limits), class_="note"),
         element("p", element("strong", summary(limits)), class_="lead"),
@@ -93,8 +76,8 @@ def check_html(limits: Limits) -> str:
         element("section", element("h2", "Tags"), _tags(limits.tags), aria_label="Tags"),
         element("section", element("h2", "Over time"), _charts(limits), aria_label="Over time"),
     )
-    css = Path(__file__).with_name("page").joinpath("page.css").read_text(encoding="utf-8")
-    return _PAGE.substitute(title=escaped(f"Check of {limits.name}"), style=css + _STYLE, body=body)
+    whole = together(element("header", element("h1", title)), element("main", body))
+    return document(title, whole, style=_STYLE)
 
 
 def _about(limits: Limits) -> str:

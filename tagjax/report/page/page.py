@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from pathlib import Path
 from string import Template
 
@@ -11,6 +9,7 @@ from ...core.files import write_atomic
 from ...core.progress import OnProgress, unobserved
 from . import sections
 from .contents import Contents, read_contents
+from .document import document, template
 from .html import Html, element, escaped, together
 from .pictures import PageVideo, page_videos
 
@@ -35,8 +34,6 @@ def write_page(run: Path, path: Path | None = None, *, on_progress: OnProgress =
 
 def page_text(contents: Contents, path: Path, on_progress: OnProgress = unobserved) -> str:
     """The page's HTML; `path` is where it will lie, for links to videos that it cannot hold."""
-    script, style = _template("page.js"), palette_css() + _template("page.css")
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     title = _title(contents)
     shown = contents.recordings()[:MAX_RECORDINGS]
     parts = [
@@ -55,14 +52,10 @@ def page_text(contents: Contents, path: Path, on_progress: OnProgress = unobserv
         element("section", element("h2", heading), content, id=name, aria_label=heading)
         for heading, name, content in there
     ]
-    return Template(_template("page.html")).substitute(
-        title=escaped(title),
-        style=style,
-        script=script,
-        digest=digest,
-        links=together(*links),
-        sections=together(*body),
+    whole = Template(template("page.html")).substitute(
+        title=escaped(title), links=together(*links), sections=together(*body)
     )
+    return document(title, Html(whole), script=template("page.js"), media=True)
 
 
 def _title(contents: Contents) -> str:
@@ -135,12 +128,3 @@ def _recording(contents: Contents, name: str, place: int, videos: dict[tuple[str
         data_begin=f"{times_s[0]:.4f}",
         data_end=f"{times_s[-1]:.4f}",
     )
-
-
-def palette_css() -> str:
-    """The colours of the pages, light and dark, as variables of CSS: paper, ink, and c0 to c7 of the tags."""
-    return _template("palette.css")
-
-
-def _template(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
