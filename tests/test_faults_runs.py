@@ -331,7 +331,6 @@ def test_every_file_is_written_whole_or_not_at_all() -> None:
         "tagjax/evaluation/sweep.py",  # lines.jsonl as well
         "tagjax/live/stream.py",  # frames.jsonl and events.jsonl as well
         "tagjax/recording/capture/writer.py",  # chunks that no reader sees before the metadata names them
-        "tagjax/recording/capture/writing_thread.py",  # preview.jpg, beside which it is written and then renamed
         "tagjax/evaluation/paper/traced.py",  # into a partial file of atomic_path
         "tagjax/report/paper/style.py",  # into memory
     }

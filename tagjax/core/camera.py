@@ -32,6 +32,18 @@ def working_stride(width: int, stride: int | None = None) -> int:
     return stride
 
 
+def check_rotation(rotation: Any, where: str, meaning: str, *, max_skew: float) -> None:
+    """Raise `RecordingError` for what is no rotation (3, 3), orthogonal within `max_skew`.
+
+    The error names `where` it comes from, and `meaning`, what is expected.
+    """
+    matrix = np.asarray(rotation, float)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise RecordingError(f"{where}: rotation is {matrix.tolist()}; expected 3 rows of 3 finite numbers.")
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > max_skew or np.linalg.det(matrix) < 0:
+        raise RecordingError(f"{where}: rotation {matrix.tolist()} is no rotation; expected {meaning}.")
+
+
 def _finite(value: Any) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(float(value))
 

@@ -12,15 +12,15 @@ from ..core.errors import RecordingError
 from ..core.names import MAX_NAME, valid_name
 from ..core.settings import ConfigError
 from ..core.types import LazyArray
-from ..recording.importers.read_values import stamp_ns
-from ..recording.importers.rows import RowError
+from ..recording.computed_frames import ComputedFrames
+from ..recording.importers.rgbd.times import start_time_ns
 from ..recording.importers.tables import import_table
 from ..recording.reads import TagReads
 from ..recording.recording import Recording
 from ..recording.store import open_recording, save_recording
 from .matching import MatchSettings, depth_of_pair
 from .pair_check import check_pairs
-from .pictures import ComputedFrames, open_pictures
+from .pictures import open_pictures
 from .rectification import Rectification, rectify
 from .rig import StereoRig, read_rig
 
@@ -137,8 +137,9 @@ def _of_pair(settings: StereoSettings) -> tuple[Recording, LazyArray, Rectificat
     _check_alike(settings, rig, left, right)
     _check_times(times, right_times)
     lines = [f"{len(left)} pairs of {Path(str(settings.left)).name} and {Path(str(settings.right)).name}"]
-    if settings.start is not None:
-        times = times - times[0] + _start_ns(settings.start)
+    start_ns = start_time_ns(settings.start)
+    if start_ns is not None:
+        times = times - times[0] + start_ns
     reads, clock = TagReads.empty(), None
     if settings.reads is not None:
         reads, clock, report = import_table(
@@ -198,12 +199,3 @@ def _check_times(left_ns: np.ndarray, right_ns: np.ndarray) -> None:
             f"expected at most {_MAX_APART:g} of the {frame_ns * 1e-6:.1f} ms of a frame. One camera dropped frames: use cameras with "
             "a common trigger, or give fps if the times are wrong."
         )
-
-
-def _start_ns(start: Any) -> int:
-    try:
-        return stamp_ns(repr(start) if isinstance(start, float) else str(start))
-    except RowError as error:
-        raise RecordingError(
-            f"start is {start!r} ({error}); expected the time of the first frame: 2025-06-01T12:00:00.250Z, or seconds since 1970."
-        ) from error

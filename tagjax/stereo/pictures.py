@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from ..core.errors import RecordingError
+from ..recording.computed_frames import ComputedFrames
 from ..recording.image_files import natural_sorted, read_colour
 from ..recording.importers.read_values import stamp_ns
 from ..recording.importers.rows import RowError
@@ -18,28 +17,6 @@ PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
 _NOT_A_TIME = 10**7  # picture names up to here are numbers of frames
-
-
-class ComputedFrames:
-    """Frames that are computed when indexed; usable as an array of a Recording."""
-
-    def __init__(self, shape: tuple[int, ...], dtype: Any, compute: Callable[[int], np.ndarray]):
-        self.shape, self.dtype, self._compute = shape, np.dtype(dtype), compute
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self[:], dtype)
-
-    def __getitem__(self, index: Any, /) -> np.ndarray:
-        if isinstance(index, slice):
-            frames = [self._compute(frame) for frame in range(*index.indices(len(self)))]
-            return np.stack(frames) if frames else np.empty((0, *self.shape[1:]), self.dtype)
-        frame = int(index)
-        if not -len(self) <= frame < len(self):
-            raise IndexError(f"Frame {frame} of {len(self)}.")
-        return self._compute(frame % len(self))
 
 
 def open_pictures(path: str | Path, side: str, fps: float | None) -> tuple[ComputedFrames, np.ndarray]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.camera import Intrinsics
+from ..core.camera import Intrinsics, check_rotation
 from ..core.errors import RecordingError
 from ..core.files import write_atomic
 from ..core.json_text import parse_json
@@ -57,13 +57,8 @@ class StereoRig:
                 f"{where}: the left camera has {sizes[0][0]} x {sizes[0][1]} pixels, the right one {sizes[1][0]} x {sizes[1][1]}; "
                 "expected one size. Use one resolution for both, and calibrate at it."
             )
-        rotation, shift = np.asarray(self.rotation, float), np.asarray(self.translation_m, float)
-        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
-            raise RecordingError(f"{where}: rotation is {rotation.tolist()}; expected 3 rows of 3 finite numbers.")
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _MAX_SKEW or np.linalg.det(rotation) < 0:
-            raise RecordingError(
-                f"{where}: rotation {rotation.tolist()} is no rotation; expected X_right = rotation X_left + translation_m."
-            )
+        check_rotation(self.rotation, where, "X_right = rotation X_left + translation_m", max_skew=_MAX_SKEW)
+        shift = np.asarray(self.translation_m, float)
         if shift.shape != (3,) or not np.isfinite(shift).all():
             raise RecordingError(f"{where}: translation_m is {shift.tolist()}; expected 3 finite numbers in metres.")
         self._check_baseline(where)

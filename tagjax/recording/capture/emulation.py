@@ -12,7 +12,7 @@ import asyncio
 import contextlib
 import dataclasses
 import threading
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -210,6 +210,3 @@ class AbstractEmulator(abc.ABC):
                 await self.send(rows)
             else:
                 await asyncio.sleep(max(1e-9 * (leaves[self._next] - now), 0.0))
-
-
-Send = Callable[[bytes], Awaitable[None]]

@@ -72,11 +72,22 @@ class _AbstractHardwareCamera(AbstractCamera):
         return {"name": self.name, "frame_rate_hz": self.settings.frame_rate_hz, **self._about}
 
 
-class RealSenseCamera(_AbstractHardwareCamera):
+class _AbstractPipelineCamera(_AbstractHardwareCamera):
+    """A camera whose package gives its frames by a pipeline."""
+
+    _pipeline: Any = None
+
+    def close(self) -> None:
+        """Stop the camera."""
+        pipeline, self._pipeline = self._pipeline, None
+        if pipeline is not None:
+            pipeline.stop()
+
+
+class RealSenseCamera(_AbstractPipelineCamera):
     """Intel RealSense D400 and L500 (package pyrealsense2). Untested on hardware."""
 
     name = "RealSense"
-    _pipeline: Any = None
 
     def open(self) -> VideoFormat:
         """Start colour and depth."""
@@ -129,18 +140,11 @@ class RealSenseCamera(_AbstractHardwareCamera):
         device_ns = round(1e6 * colour.get_timestamp())
         return CameraFrame(np.asanyarray(colour.get_data()).copy(), values, arrival_ns, device_ns)
 
-    def close(self) -> None:
-        """Stop the camera."""
-        pipeline, self._pipeline = self._pipeline, None
-        if pipeline is not None:
-            pipeline.stop()
 
-
-class OrbbecCamera(_AbstractHardwareCamera):
+class OrbbecCamera(_AbstractPipelineCamera):
     """Orbbec Femto, Gemini, Astra 2 (package pyorbbecsdk2). Untested on hardware."""
 
     name = "Orbbec"
-    _pipeline: Any = None
 
     def open(self) -> VideoFormat:
         """Start colour and depth."""
@@ -195,12 +199,6 @@ class OrbbecCamera(_AbstractHardwareCamera):
         picture = np.frombuffer(colour.get_data(), np.uint8).reshape(*shape, 3).copy()
         values = _millimetres(raw, round(float(depth.get_depth_scale()), 6))
         return CameraFrame(picture, values, arrival_ns, 1000 * int(colour.get_timestamp_us()))
-
-    def close(self) -> None:
-        """Stop the camera."""
-        pipeline, self._pipeline = self._pipeline, None
-        if pipeline is not None:
-            pipeline.stop()
 
 
 class AzureKinectCamera(_AbstractHardwareCamera):

@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from ..image_files import write_image
 from .camera import AbstractCamera, CameraFrame
 from .progress import Progress
 from .reads import CapturedRead, ReaderEvent, ReaderInfo
@@ -140,18 +141,12 @@ def _num_bytes(frame: CameraFrame) -> int:
 
 def write_preview(path: Path, frame: CameraFrame) -> None:
     """A small picture of a frame: colour beside depth, near bright."""
-    import cv2
-
     step = max(1, frame.colour.shape[1] // _PREVIEW_WIDTH)
     colour, depth = frame.colour[::step, ::step], np.nan_to_num(frame.depth[::step, ::step].astype(np.float32))
     far = max(float(np.quantile(depth, 0.98)), 1e-6)
     near = np.where(depth > 0, 255 * (1 - np.clip(depth / far, 0, 1)), 0).astype(np.uint8)
     picture = np.concatenate([colour, np.repeat(near[..., None], 3, 2)], axis=1)
-    found, coded = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., ::-1]))
-    if found:
-        partial = path.with_suffix(".partial")
-        partial.write_bytes(coded.tobytes())
-        partial.replace(path)
+    write_image(path, picture)
 
 
 class FilmingThread:

@@ -15,6 +15,7 @@ from ...core.camera import Intrinsics
 from ...core.errors import RecordingError
 from ...core.geometry import register_depth, undistort
 from ...core.names import valid_name
+from ..computed_frames import ComputedFrames
 from ..image_files import natural_sorted, read_colour, read_image, read_labels
 from ..reads import TagReads
 from ..recording import Recording, Truth
@@ -50,29 +51,19 @@ class DepthToColour:
         )
 
 
-class FrameFiles:
-    """Frames stored as files, decoded by `decode(path)` when indexed; usable as an array of a Recording."""
+class FrameFiles(ComputedFrames):
+    """Frames stored as files, decoded by `decode(path)`. Raises `RecordingError` for one of another shape than the others'."""
 
     def __init__(self, files: Sequence[Path], decode: Callable[[Path], np.ndarray], shape: tuple[int, ...], dtype: Any):
-        self._files, self._decode = list(files), decode
-        self.shape = (len(self._files), *shape)
-        self.dtype = np.dtype(dtype)
+        def decoded(number: int) -> np.ndarray:
+            frame = decode(files[number])
+            if frame.shape != shape:
+                raise RecordingError(
+                    f"{files[number]}: an image of shape {frame.shape}; expected {shape} like the others."
+                )
+            return frame
 
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self[:], dtype)
-
-    def __getitem__(self, index: Any, /) -> np.ndarray:
-        if isinstance(index, slice):
-            frames = [self[i] for i in range(*index.indices(len(self._files)))]
-            return np.stack(frames) if frames else np.empty((0, *self.shape[1:]), self.dtype)
-        path = self._files[int(index)]
-        frame = self._decode(path)
-        if frame.shape != self.shape[1:]:
-            raise RecordingError(f"{path}: an image of shape {frame.shape}; expected {self.shape[1:]} like the others.")
-        return frame
+        super().__init__((len(files), *shape), dtype, decoded)
 
 
 def read_mat_depth(path: Path) -> np.ndarray:

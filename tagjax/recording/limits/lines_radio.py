@@ -166,7 +166,6 @@ def _speed(tags: list[TagLimits], thresholds: Thresholds) -> Line:
 
 def _rssi(tags: list[TagLimits], thresholds: Thresholds) -> Line:
     limits = thresholds.rssi_dbm
-
     verdict, found, _ = _of_tags(tags, lambda tag: tag.rssi_dbm, limits, lambda value: f"{value:.1f} dBm")
     return Line(
         name="rssi",

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ....core.camera import Intrinsics
+from ....core.camera import Intrinsics, check_rotation
 from ....core.errors import RecordingError
 
 MAX_UNIT_M = 0.1
@@ -46,13 +46,8 @@ class Rig:
                 f"{where}: depth_unit_m is {self.depth_unit_m!r}; expected the metres of one unit of depth, above 0 and at most "
                 f"{MAX_UNIT_M:g} (0.001 for millimetres)."
             )
-        rotation, translation = np.asarray(self.rotation, float), np.asarray(self.translation_m, float)
-        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
-            raise RecordingError(f"{where}: rotation is {rotation.tolist()}; expected 3 rows of 3 finite numbers.")
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _MAX_SKEW or np.linalg.det(rotation) < 0:
-            raise RecordingError(
-                f"{where}: rotation {rotation.tolist()} is no rotation; expected X_colour = rotation X_depth + translation_m."
-            )
+        check_rotation(self.rotation, where, "X_colour = rotation X_depth + translation_m", max_skew=_MAX_SKEW)
+        translation = np.asarray(self.translation_m, float)
         if translation.shape != (3,) or not np.linalg.norm(translation) <= _MAX_BASELINE_M:
             raise RecordingError(
                 f"{where}: translation_m is {translation.tolist()}; expected 3 numbers in metres, at most {_MAX_BASELINE_M:g} m "
