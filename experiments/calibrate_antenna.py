@@ -25,7 +25,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
     config = checked(AntennaConfig, values, folder)
     with progress_lines(shown=progress, console=console) as report:
-        found = calibrate_antenna(config, on_frame=lambda done, total: report("trace", done, total))
+        found = calibrate_antenna(config, on_progress=report)
     console.print("\n".join(found.lines()))
     print_result(dataclasses.asdict(found))
 

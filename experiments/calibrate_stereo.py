@@ -18,6 +18,7 @@ from .command import checked, command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.stereo.calibration import CalibrateStereoSettings, calibrate_stereo_folders
 
     for side in ("left", "right"):
@@ -25,7 +26,8 @@ def main(values: dict[str, Any], folder: Path) -> None:
             raise ValueError(f"found no {side}; expected {side}=<folder of pictures of the checkerboard>.")
     progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
     settings = checked(CalibrateStereoSettings, values, folder)
-    _, lines = calibrate_stereo_folders(settings, progress=progress)
+    with progress_lines(shown=progress, console=console) as report:
+        _, lines = calibrate_stereo_folders(settings, on_progress=report)
     for line in (*lines, f"written to {settings.out}"):
         console.print(line, markup=False)
 

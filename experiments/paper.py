@@ -31,7 +31,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     config = from_mapping(PaperConfig, {**values, "suites": suites_named(suites())})
     write_config(values, folder)
     with progress_lines(shown=progress, console=console) as report:
-        drawn = run_paper(config, folder, on_progress=lambda done, total, now: report("figures", done, total, now))
+        drawn = run_paper(config, folder, on_progress=report)
     for one in drawn:
         console.print(f"{one.title}: {one.picture or one.seen}", soft_wrap=True, highlight=False)
     console.print(f"figures.md, figures.json and the figures in {folder}", soft_wrap=True, highlight=False)

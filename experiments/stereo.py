@@ -19,10 +19,13 @@ from .command import checked, command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
+    from tagjax.core.progress import progress_lines
     from tagjax.stereo.conversion import StereoSettings, stereo_recording
 
     progress, console = values.pop("progress"), Console(soft_wrap=True, highlight=False, markup=False)
-    _, lines = stereo_recording(checked(StereoSettings, values, folder), progress=progress)
+    settings = checked(StereoSettings, values, folder)
+    with progress_lines(shown=progress, console=console):
+        _, lines = stereo_recording(settings, progress=progress)  # frames are counted where they are written
     for line in lines:
         console.print(line, markup=False)
 

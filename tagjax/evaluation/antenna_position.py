@@ -7,13 +7,14 @@ best places of a grid, by the phases' changes within dwells, and is refined from
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError
 from ..radio.antenna_position import AntennaPosition, PathReads, fit_position, position_coherence
 from ..radio.noise import thermal_sigma_rad
@@ -94,16 +95,14 @@ def _text(values: tuple[float, ...]) -> str:
     return ", ".join(f"{value:+.3f}" for value in values)
 
 
-def calibrate_antenna(
-    config: AntennaConfig, *, on_frame: Callable[[int, int], None] = lambda done, total: None
-) -> FoundAntenna:
-    """Find the antenna. `on_frame(done, total)` is called as the path is traced.
+def calibrate_antenna(config: AntennaConfig, *, on_progress: OnProgress = unobserved) -> FoundAntenna:
+    """Find the antenna. `on_progress` counts the frames of a path that is traced.
 
     Raises `RecordingError` for a tag or antenna without enough reads, for a path that is not known, and for a position that
     the recording does not determine.
     """
     recording = open_recording(config.recording)
-    source, path_m = _path(recording, config, on_frame)
+    source, path_m = _path(recording, config, on_progress)
     return find_antenna(recording, path_m, config, source=source)
 
 
@@ -203,7 +202,7 @@ def path_reads(
     )
 
 
-def _path(recording: Recording, config: AntennaConfig, on_frame: Callable[[int, int], None]) -> tuple[str, np.ndarray]:
+def _path(recording: Recording, config: AntennaConfig, on_progress: OnProgress) -> tuple[str, np.ndarray]:
     """Where the path is from, and the tag's place at every frame, (frames, 3) metres."""
     known = recording.truth is not None and config.epc in recording.truth.tag_position_m
     if config.path == "truth" and not known:
@@ -213,10 +212,10 @@ def _path(recording: Recording, config: AntennaConfig, on_frame: Callable[[int, 
     if known and config.path != "traced":
         assert recording.truth is not None
         return "truth", np.asarray(recording.truth.tag_position_m[config.epc], float)
-    return "traced", traced_path_m(recording, config, on_frame)
+    return "traced", traced_path_m(recording, config, on_progress)
 
 
-def traced_path_m(recording: Recording, config: AntennaConfig, on_frame: Callable[[int, int], None]) -> np.ndarray:
+def traced_path_m(recording: Recording, config: AntennaConfig, on_progress: OnProgress) -> np.ndarray:
     """The centre of the object that carries the tag at every frame, offline, smoothed; NaN where it is not detected.
 
     It is the middle of the surface that the camera sees. The distance from there to the tag, if it is the same throughout,
@@ -234,7 +233,7 @@ def traced_path_m(recording: Recording, config: AntennaConfig, on_frame: Callabl
     ):
         if np.asarray(trace.detected)[0]:
             path_m[number] = np.asarray(trace.centre_m)[0]
-        on_frame(number + 1, recording.num_frames)
+        on_progress("trace", number + 1, recording.num_frames)
     return _smoothed(recording.frame_time_s(), path_m)
 
 

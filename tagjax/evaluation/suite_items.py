@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+from ..core.camera import working_stride
 from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError, from_mapping
+from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
 from ..recording.store import open_recording
 from ..sim.suites import PLANAR, SPLITS, Item, Suite, make_items
+from ..tagattention.tracer_settings import settled
+from ..tracing.clips import ClipSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,3 +71,19 @@ class SuiteSelection:
     def open(self, item: Item) -> Recording:
         """The recording of an item."""
         return open_recording(item.path(Path(self.recordings_dir)))
+
+
+def result_key(item: Item, tracer: Mapping[str, Any], clips: ClipSettings, scores: ScoreSettings) -> str:
+    """A hash, 64 hexadecimal digits, of all settings that determine a tracer's result on a recording.
+
+    `tracer` are settings as under conf/tracer. How many other recordings the suite has does not matter.
+    """
+    width = item.suite.capture.intrinsics().width
+    parts = [
+        {**item.suite.as_dict(), "counts": None},
+        item.name,
+        settled(tracer, width),
+        dataclasses.asdict(dataclasses.replace(clips, stride=working_stride(width, clips.stride))),
+        dataclasses.asdict(scores),
+    ]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()

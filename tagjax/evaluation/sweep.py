@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import hashlib
 import itertools
 import json
 import math
@@ -18,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from ..core.camera import working_stride
 from ..core.files import write_atomic, writing
 from ..core.progress import OnProgress, unobserved
 from ..core.results import markdown_table, to_json_values, write_csv
@@ -27,8 +25,9 @@ from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_record
 from ..recording.store import open_recording
 from ..report.sweep import curve_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
-from ..tagattention.tracer_settings import make_tracer, setting_names, settled, tracer_clips, with_values
+from ..tagattention.tracer_settings import make_tracer, setting_names, tracer_clips, with_values
 from ..tracing.clips import ClipSettings, clip_loader
+from .suite_items import result_key
 
 _MAX_NAMES = 12  # of parameters in an error
 _MAX_CURVES = 6
@@ -105,15 +104,14 @@ def run_sweep(config: SweepConfig, folder: Path, *, on_progress: OnProgress = un
         make_tracer(with_values(config.tracer, point)) for point in points
     ]  # a wrong value raises before the work starts
     work = [
-        (suite, item)
+        item
         for name, values in config.suites.items()
-        for suite in [_suite(config, from_mapping(Suite, values, where=f"suite {name}"))]
-        for item in _items(config, suite, on_progress)
+        for item in _items(config, _suite(config, from_mapping(Suite, values, where=f"suite {name}")), on_progress)
     ]
     known = {line.key: line for line in read_lines(folder / _LINES)}
     lines: list[Line] = []
-    for suite, item in work:
-        keys = [_key(config, suite, item, point) for point in points]
+    for item in work:
+        keys = [_key(config, item, point) for point in points]
         if all(key in known for key in keys):
             lines += [known[key] for key in keys]
             continue
@@ -168,17 +166,8 @@ def _caching_loader(clips: ClipSettings) -> Callable[..., Any]:
     return load
 
 
-def _key(config: SweepConfig, suite: Suite, item: Item, point: Mapping[str, Value]) -> str:
-    scene = {**suite.as_dict(), "counts": None}  # the number of other recordings has no influence
-    width, clips = suite.capture.intrinsics().width, config.clip_settings()
-    parts = [
-        scene,
-        item.name,
-        settled(with_values(config.tracer, point), width),
-        dataclasses.asdict(dataclasses.replace(clips, stride=working_stride(width, clips.stride))),
-        dataclasses.asdict(config.scores),
-    ]
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:20]
+def _key(config: SweepConfig, item: Item, point: Mapping[str, Value]) -> str:
+    return result_key(item, with_values(config.tracer, point), config.clip_settings(), config.scores)[:20]
 
 
 def _condition(item: Item) -> str:

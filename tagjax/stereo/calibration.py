@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import RecordingError
-from ..core.progress import tracked
+from ..core.progress import OnProgress, unobserved
 from ..image.checkerboard import Board, CalibrationError, CameraCalibration, calibrate, check_corners, find_corners
 from ..recording.image_files import natural_sorted, read_colour
 from .rectification import rectify, row_difference_px
@@ -149,11 +149,11 @@ class CalibrateStereoSettings:
 
 
 def calibrate_stereo_folders(
-    settings: CalibrateStereoSettings, *, progress: bool = False
+    settings: CalibrateStereoSettings, *, on_progress: OnProgress = unobserved
 ) -> tuple[StereoCalibration, list[str]]:
     """Calibrate from two folders, write the camera file, and report line by line.
 
-    Pictures are paired in natural order of their names. Raises `CalibrationError` for folders that cannot be used, and errors
+    Pictures are paired in natural order of their names. `on_progress` counts the pairs. Raises `CalibrationError` for folders that cannot be used, and errors
     as of `calibrate_pair`.
     """
     files = [_pictures(side, getattr(settings, side)) for side in ("left", "right")]
@@ -164,7 +164,8 @@ def calibrate_stereo_folders(
         )
     views: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     without, shape = [], None
-    for pair in tracked(zip(*files, strict=True), "find the board", len(files[0]), shown=progress):
+    for number, pair in enumerate(zip(*files, strict=True)):
+        on_progress("find the board", number, len(files[0]), pair[0].name)
         pictures = [_read(path) for path in pair]
         for path, picture in zip(pair, pictures, strict=True):
             shape = shape or picture.shape[:2]
@@ -179,6 +180,7 @@ def calibrate_stereo_folders(
             continue
         views[0].append(corners[0])
         views[1].append(corners[1])
+    on_progress("find the board", len(files[0]), len(files[0]))
     assert shape is not None
     found = calibrate_pair(*views, settings.board, shape[1], shape[0], num_radial=settings.num_radial)
     write_rig(

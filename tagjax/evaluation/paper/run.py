@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 from ...core.files import write_atomic
 from ...core.json_text import parse_json
+from ...core.progress import OnProgress, unobserved
 from ...core.results import write_json
 from ...core.settings import from_mapping
 from ...sim.suites import Item
@@ -30,24 +30,21 @@ class Drawn:
     seen: str
 
 
-def run_paper(
-    config: PaperConfig, folder: Path, *, on_progress: Callable[[int, int, str], None] | None = None
-) -> list[Drawn]:
+def run_paper(config: PaperConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> list[Drawn]:
     """Draw the chosen figures into `folder`, each a PNG with a CSV of its numbers, and return them.
 
-    `figures.md` shows all figures that the folder holds, also those of runs before; `figures.json` lists them. `on_progress` gets the number of figures that are done, of all, and what is being done. With `all` and without
-    simulation a figure whose recordings are missing is left out with the reason. Raises `ConfigError` where a figure that
-    is named has no recording.
+    `figures.md` shows all figures that the folder holds, also those of runs before; `figures.json` lists them. `on_progress`
+    counts the figures. With `all` and without simulation a figure whose recordings are missing is left out with the reason.
+    Raises `ConfigError` where a figure that is named has no recording.
     """
     names = chosen(config.figures())
     drawn: list[Drawn] = []
 
     def report(text: str) -> None:
-        if on_progress is not None:
-            name = names[min(len(drawn), len(names) - 1)]
-            on_progress(len(drawn), len(names), f"figure {name}: {text}")
+        name = names[min(len(drawn), len(names) - 1)]
+        on_progress("figures", len(drawn), len(names), f"figure {name}: {text}")
 
-    sources = Sources(config, folder, report)
+    sources = Sources(config, folder, report, on_progress)
     for name in names:
         report("recordings")
         try:
@@ -60,6 +57,7 @@ def run_paper(
         listed = [known[name] for name in FIGURES if name in known]
         write_json(folder / LIST, [dataclasses.asdict(one) for one in listed])
         write_atomic(folder / PAGE, page(listed))
+    on_progress("figures", len(drawn), len(names))
     return drawn
 
 

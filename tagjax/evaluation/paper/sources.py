@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ...core.camera import working_stride
+from ...core.progress import OnProgress, unobserved
 from ...core.settings import ConfigError, from_mapping
 from ...metrics.locking import first_motion
 from ...metrics.recordings import Picture, evaluate_recording
@@ -18,9 +17,10 @@ from ...recording import Recording
 from ...recording.store import open_recording
 from ...report.paper.curves import NUM_FRAMES
 from ...sim.suites import PLANAR, Item, Suite, make_items
-from ...tagattention.tracer_settings import make_tracer, settled, tracer_clips
+from ...tagattention.tracer_settings import make_tracer, tracer_clips
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
+from ..suite_items import result_key
 from .settings import PaperConfig
 from .traced import Traced, read_traced, write_traced
 
@@ -45,10 +45,19 @@ class System:
 
 
 class Sources:
-    """Finds the recordings of suites, simulates missing ones, and traces them; results are kept in `folder`/traces."""
+    """Finds the recordings of suites, simulates missing ones, and traces them; results are kept in `folder`/traces.
 
-    def __init__(self, config: PaperConfig, folder: Path, report: Callable[[str], None] = lambda _: None):
-        self.config, self.folder, self.report = config, folder, report
+    `report` is called with what is being done; `on_progress` counts recordings that are simulated.
+    """
+
+    def __init__(
+        self,
+        config: PaperConfig,
+        folder: Path,
+        report: Callable[[str], None] = lambda _: None,
+        on_progress: OnProgress = unobserved,
+    ):
+        self.config, self.folder, self.report, self._on_progress = config, folder, report, on_progress
         self._tracers: dict[str, AbstractTracer] = {}
         self._made: dict[tuple[str, ...], Any] = {}
 
@@ -83,7 +92,7 @@ class Sources:
                 splits=self._splits_with(suite, splits)[: 1 if one else None],
                 max_per_variant=limit,
                 workers=config.workers,
-                on_progress=lambda stage, done, total, now="": self.report(f"{stage}, {done} of {total}"),
+                on_progress=self._on_progress,
             )
         else:
             found = [item for item in suite.items() if item.split in splits and item.path(folder).exists()]
@@ -161,16 +170,7 @@ class Sources:
 
     def _key(self, system: System, item: Item) -> str:
         """A hash of all that determines the result."""
-        scene = {**dataclasses.asdict(item.suite), "counts": None}
-        width, clips = item.suite.capture.intrinsics().width, system.clip_settings()
-        parts = [
-            scene,
-            item.name,
-            settled(system.settings, width),
-            dataclasses.asdict(dataclasses.replace(clips, stride=working_stride(width, clips.stride))),
-            dataclasses.asdict(self.config.scores),
-        ]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        return result_key(item, system.settings, system.clip_settings(), self.config.scores)[:16]
 
 
 def last_frame(recording: Recording) -> int:

@@ -128,7 +128,7 @@ class Tracing:
 
         Settings (.yaml) and learned parameters (.json) enter by their values, all other files by their content.
         """
-        suite = dataclasses.asdict(item.suite)
+        suite = item.suite.as_dict()
         for name in ("about", "paper", "counts", "variants"):  # about other recordings, or descriptions
             del suite[name]
         width = item.suite.capture.intrinsics().width
