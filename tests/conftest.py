@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import signal
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import jax
@@ -137,3 +140,19 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from report_runs import report_run
 
     return report_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A headless Chromium."""
+    chromium = next(
+        (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+    )
+    if chromium is None:
+        pytest.skip("Chromium is not installed (Debian: apt-get install chromium)")
+    driving = pytest.importorskip("playwright.sync_api", reason="playwright, of the dev extra, is not installed")
+    with driving.sync_playwright() as driver:
+        sandbox = [] if os.geteuid() else ["--no-sandbox"]  # Chromium's sandbox does not run as root
+        opened = driver.chromium.launch(executable_path=chromium, args=sandbox)
+        yield opened
+        opened.close()

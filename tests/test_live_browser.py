@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -15,17 +12,6 @@ import pytest
 from live_views import HOSTILE, TAGS, view
 
 from tagjax.live.page import LivePage, PageSettings
-
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (Debian: apt-get install chromium)"),
-    pytest.mark.skipif(
-        importlib.util.find_spec("playwright") is None, reason="playwright, of the dev extra, is not installed"
-    ),
-]
 
 
 class Stream:
@@ -57,17 +43,6 @@ def stream() -> Iterator[Stream]:
     one = Stream()
     yield one
     one.close()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        sandbox = [] if os.geteuid() else ["--no-sandbox"]  # Chromium's sandbox does not run as root
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=sandbox)
-        yield opened
-        opened.close()
 
 
 def _open(browser: Any, stream: Stream, problems: list[str], **options: Any) -> Any:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +11,6 @@ from report_runs import NUM_FRAMES
 
 from tagjax.report.page import PAGE, write_page
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (Debian: apt-get install chromium)"),
-    pytest.mark.skipif(
-        importlib.util.find_spec("playwright") is None, reason="playwright, of the dev extra, is not installed"
-    ),
-]
-
-
 _PATIENCE_S = 30.0
 """How long a condition of the page may take to come true: the machine may be busy."""
 
@@ -34,17 +18,6 @@ _PATIENCE_S = 30.0
 @pytest.fixture(scope="module")
 def address(finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     return write_page(finished_run, tmp_path_factory.mktemp("page") / PAGE).as_uri()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        sandbox = [] if os.geteuid() else ["--no-sandbox"]  # Chromium's sandbox does not run as root
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=sandbox)
-        yield opened
-        opened.close()
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import html
 import importlib.util
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,9 +18,6 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(path.stem for path in (ROOT / "docs").glob("*.md"))
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
 
 
 def _leaves(nav: list[Any]) -> Iterator[str]:
@@ -159,18 +155,6 @@ def test_nothing_comes_from_the_network(site: Path) -> None:
         assert [one for one in loaded if re.match(r"(https?:)?//", one)] == [], path.name
     styles = " ".join(path.read_text() for path in site.rglob("*.css"))
     assert re.findall(r"(?:@import|url\()[\"']?(?:https?:)?//[^)]*", styles) == []
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    if CHROMIUM is None:
-        pytest.skip("Chromium is not installed (Debian: apt-get install chromium)")
-    api = pytest.importorskip("playwright.sync_api")
-    with api.sync_playwright() as driver:
-        sandbox = [] if os.geteuid() else ["--no-sandbox"]  # Chromium's sandbox does not run as root
-        opened = driver.chromium.launch(executable_path=CHROMIUM, args=sandbox)
-        yield opened
-        opened.close()
 
 
 def _open(browser: Any, address: str, width: int) -> tuple[Any, list[str]]:
