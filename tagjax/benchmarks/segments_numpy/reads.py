@@ -1,4 +1,4 @@
-"""Evidence of reads for each (tag, segment): `radio.reader_model`, `tagattention.segments.dwell` and `.detection`.
+"""Evidence of reads for each (tag, segment): `radio.reader_model`, `tagattention.segments.dwell`, `.free_path` and `.detection`.
 
 Reads of different tags are added at once: first each tag's first read of the frame, then each one's second, and so on.
 """
@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import i0e
+from scipy.special import expit, i0e
 
 from ...core.numerics import SPEED_OF_LIGHT_M_S
 from ...radio.noise import UNKNOWN_RSSI_DBM
 from ...radio.reader_model import ReaderModel
 from ...tagattention.segments import dwell as original
+from ...tagattention.segments import free_path as original_free
 from ...tagattention.segments.detection import Detection
+from ...tagattention.segments.free_path import FreePath
 
 Reads = dict[str, np.ndarray]
 """The fields of a frame's `Arrivals`."""
@@ -148,29 +150,77 @@ def _rounds(tag: Int[np.ndarray, " read"], valid: Bool[np.ndarray, " read"]) -> 
     return [order[rank == number] for number in range(rank.max() + 1)]
 
 
+class FreePaths:
+    """Evidence for paths that nothing in view follows, in place; see `FreePath`."""
+
+    def __init__(self, settings: FreePath, model: ReaderModel, num_tags: int, num_antennas: int) -> None:
+        self.reader, self.walk = Reader(model), np.float32(settings.walk_m2_s3)
+        self.speed_m_s = np.linspace(-settings.max_speed_m_s, settings.max_speed_m_s, settings.num_speeds).astype("f4")
+        self.apart2 = np.square(self.speed_m_s[:, None] - self.speed_m_s)
+        rows = num_tags, num_antennas, settings.num_speeds
+        self.phasor = np.zeros(rows, np.complex64)
+        self.probability = np.full(rows, 1 / settings.num_speeds, np.float32)
+        self.time_s = np.full(rows[:2], np.nan, np.float32)
+        self.channel = np.full(rows[:2], -1, np.int32)
+        self.log_likelihood = np.zeros(num_tags, np.float32)
+
+    def step(self, arrivals: Reads, memory_s: np.float32, since_s: np.float32, now_s: np.float32) -> np.ndarray:
+        """What a frame's reads add to the evidence of each tag, nats."""
+        added = np.zeros_like(self.log_likelihood)
+        for at in _rounds(arrivals["tag"], arrivals["valid"]):
+            tag, antenna, time_s = arrivals["tag"][at], arrivals["antenna"][at], arrivals["time_s"][at]
+            last_s = self.time_s[tag, antenna]
+            gap_s = np.where(np.isfinite(last_s), np.maximum(time_s - last_s, 0), np.float32(0))
+            walk_m_s = np.maximum(np.sqrt(self.walk * gap_s), np.float32(original_free._SHORTEST_WALK_M_S))
+            spread = np.exp(-0.5 * self.apart2 / np.square(walk_m_s)[:, None, None])
+            spread /= spread.sum(axis=1, keepdims=True)
+            probability = np.einsum("rij,rj->ri", spread, self.probability[tag, antenna])
+            goes_on = (arrivals["channel"][at] == self.channel[tag, antenna])[:, None]
+            phasor = np.where(goes_on, self.phasor[tag, antenna], np.complex64(0))
+            moved_m, depth_m = gap_s[:, None] * self.speed_m_s, np.full(1, original_free._DEPTH_M, np.float32)
+            phasor = self.reader.moved(phasor, moved_m, depth_m, arrivals["carrier_hz"][at])
+            speeds = np.broadcast_to(self.speed_m_s, moved_m.shape)
+            concentration = self.reader.concentration(arrivals["rssi_dbm"][at], speeds)
+            evidence, phasor = self.reader.add(phasor, concentration, arrivals["phase_rad"][at])
+            explained = probability * np.exp(evidence)
+            total = explained.sum(axis=1)
+            self.phasor[tag, antenna], self.probability[tag, antenna] = phasor, explained / total[:, None]
+            self.time_s[tag, antenna], self.channel[tag, antenna] = time_s, arrivals["channel"][at]
+            added[tag] += np.exp(-np.maximum(now_s - time_s, 0) / memory_s) * np.log(total)
+        self.log_likelihood = np.exp(-(now_s - since_s) / memory_s) * self.log_likelihood + added
+        return added
+
+
 class Confidence:
-    """Recent reads, and the probability that a tag is on its body; see `Detection`."""
+    """Recent reads, and the confidence that a tag is on its body; see `Detection`."""
 
     def __init__(self, settings: Detection, num_tags: int) -> None:
-        self.temperature_nats, self.fresh_s = (
-            np.float32(one.value) for one in (settings.temperature_nats, settings.fresh_s)
-        )
-        self.stationary, self.elsewhere = np.float32(settings.stationary), np.float32(settings.elsewhere)
+        self.settings, self.fresh_s = settings, np.float32(settings.fresh_s.value)
         self.threshold, self.num_reads = np.float32(settings.threshold), np.zeros(num_tags, np.float32)
-        self.recent_nats = np.zeros(num_tags, np.float32)
+        self.recent_nats, self.recent_free_nats = np.zeros(num_tags, np.float32), np.zeros(num_tags, np.float32)
 
-    def received(self, arrivals: Reads, added_nats: np.ndarray, since_s: np.float32, now_s: np.float32) -> None:
-        """Count a frame's reads, and what they add to the evidence for each tag's body."""
+    def received(
+        self,
+        arrivals: Reads,
+        added_nats: np.ndarray,
+        added_free_nats: np.ndarray,
+        since_s: np.float32,
+        now_s: np.float32,
+    ) -> None:
+        """Count a frame's reads, and what they add to the evidence for each tag's body and for a free path."""
         fresh = np.exp(-np.maximum(now_s - arrivals["time_s"], 0) / self.fresh_s)
         new = np.bincount(arrivals["tag"], np.where(arrivals["valid"], fresh, 0), len(self.num_reads))
         kept = np.exp(-(now_s - since_s) / self.fresh_s)
         self.num_reads = self.num_reads * kept + new.astype(np.float32)
         self.recent_nats = self.recent_nats * kept + added_nats
+        self.recent_free_nats = self.recent_free_nats * kept + added_free_nats
 
-    def of(self, body_nats: Float[np.ndarray, " tag"], stationary_nats: Float[np.ndarray, " tag"]) -> np.ndarray:
-        """The confidence of each tag."""
-        stationary = (stationary_nats - body_nats) / self.temperature_nats + self.stationary
-        elsewhere = self.elsewhere - self.recent_nats / self.temperature_nats
-        levels = np.stack([np.zeros_like(stationary), stationary, elsewhere])
-        weight = np.exp(levels - levels.max(axis=0))
-        return weight[0] / weight.sum(axis=0) * -np.expm1(-self.num_reads)
+    def of(self, body_nats: np.ndarray, stationary_nats: np.ndarray, free_nats: np.ndarray) -> np.ndarray:
+        """The confidence of each tag, from the evidence (tag) for each explanation of its reads."""
+        one = self.settings
+        moves = (body_nats - stationary_nats) / np.float32(one.moves_nats.value) - float(one.moves_level)
+        better = body_nats + float(one.recent) * self.recent_nats - float(one.stationary) * stationary_nats
+        free, free_recent = np.maximum(free_nats, 0), np.maximum(self.recent_free_nats, 0)
+        better -= float(one.free) * free + float(one.free_recent) * free_recent
+        odds = better / np.float32(one.temperature_nats.value) - float(one.level)
+        return expit(moves) * expit(odds) * -np.expm1(-self.num_reads)

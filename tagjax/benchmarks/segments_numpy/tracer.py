@@ -17,7 +17,7 @@ from .hiding import Hidden, Whole
 from .labels import Labels
 from .motion import segment_motion
 from .outline import boxes_and_centroids, dense_masks, filled_labels
-from .reads import Confidence, Dwells
+from .reads import Confidence, Dwells, FreePaths
 from .travel import Segments, Travel
 
 
@@ -61,6 +61,9 @@ class NumpyTracer:
         self.body = Body(tracer.body, num_tags, num)
         self.whole = None if tracer.whole is None else Whole(tracer.whole)
         self.hidden = None if tracer.hidden is None else Hidden(tracer.hidden, num_tags)
+        self.free = None
+        if tracer.free is not None:
+            self.free = FreePaths(tracer.free, tracer.reader, num_tags, len(self.antennas_m))
         self.confidence = Confidence(tracer.detection, num_tags)
         self.time_s: np.float32 | None = None
 
@@ -158,7 +161,11 @@ class NumpyTracer:
             hides = self.hidden.out_of_view(self.rays, np.asarray(frame.depth_m), labels, membership, dt_s)
             velocity_m_s = motion_m / max(dt_s, np.float32(1e-3))
             hides &= self.hidden.step(body_nats, some, centre_m, velocity_m_s, kept, dt_s)
-        self.confidence.received(arrivals, added_nats, since_s, now_s)
-        confidence = self.confidence.of(body_nats, nats[:, STATIC])
+        free_nats = free_added = np.zeros(len(total), np.float32)
+        if self.free is not None:
+            free_added = self.free.step(arrivals, self.dwells.memory_s, since_s, now_s)
+            free_nats = self.free.log_likelihood
+        self.confidence.received(arrivals, added_nats, free_added, since_s, now_s)
+        confidence = self.confidence.of(body_nats, nats[:, STATIC], free_nats)
         shown = present & (membership > 0.5).any(axis=1) & ~hides
         return membership, np.where(shown, confidence, np.float32(0))

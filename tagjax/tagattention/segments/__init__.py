@@ -5,6 +5,7 @@ from .body import Bodies as Bodies
 from .body import CarryingBody as CarryingBody
 from .detection import Detection as Detection
 from .dwell import DwellEvidence as DwellEvidence
+from .free_path import FreePath as FreePath
 from .labels import Segmenter as Segmenter
 from .rigid import RigidMotion as RigidMotion
 from .step import SegmentFrame as SegmentFrame

@@ -1,14 +1,17 @@
-"""Detection: the probability that a tag is on the body that its mask shows.
+"""Detection: the confidence that a tag is on the body that its mask shows.
 
-Three hypotheses explain the reads of the last seconds: the tag moves with its body (log likelihood ratio E_b to phases at
-random), it is stationary (E_s), or it was on the body and has left it of late: it is elsewhere, hidden or on something that
-is not followed, and the phases of recent reads are at random (E_b - R, where R is what these add to E_b). With a temperature
-T, as errors of a motion are common to many reads, and prior log odds c_s and c_e of the last two against the first,
+Three explanations of a tag's reads compete, each with its log likelihood ratio to phases at random in nats: the tag moves with
+its body (E_b), it is stationary (E_s), or it moves on a smooth path of its own (E_f, see `FreePath`). The best of hundreds of
+segments explains any reads fairly well. So the body counts by what it explains better than the others do:
 
-    p = exp(E_b / T) / (exp(E_b / T) + exp(E_s / T + c_s) + exp((E_b - R) / T + c_e)) .
+    confidence = p_moves p_body (1 - exp(-n))
+    p_moves = sigmoid((E_b - E_s) / T_m - c_m)
+    p_body = sigmoid((E_b + w_b R_b - w_s E_s - w_f max(E_f, 0) - w_r max(R_f, 0)) / T - c) .
 
-What was read seconds ago says little of where the tag is now: R and the number n of recent reads count each read as
-exp(-age / fresh_s). At least one is recent with probability 1 - exp(-n). The confidence is the product of the two.
+R_b and R_f are the parts of E_b and E_f from recent reads, and n is their number: each counts as exp(-age / fresh_s). What was
+read seconds ago says little of where the tag is now; at least one read is recent with probability 1 - exp(-n). The
+weights are learned without labels: the confidence should be the IoU of the mask with the smoother's, and 0 for reads that
+belong to nothing in view. So it is an IoU to be expected, and a tag is detected at far less than one half.
 """
 
 from __future__ import annotations
@@ -28,36 +31,56 @@ class RecentReads(eqx.Module):
 
     number: Float[Array, " tag"]
     nats: Float[Array, " tag"]  # evidence for the tag's body
+    free_nats: Float[Array, " tag"]  # ... for a free path
 
     @staticmethod
     def nothing(num_tags: int) -> RecentReads:
         """Before the first read."""
-        return RecentReads(jnp.zeros(num_tags), jnp.zeros(num_tags))
+        return RecentReads(*(jnp.zeros(num_tags) for _ in range(3)))
+
+
+class Explanations(eqx.Module):
+    """The evidence of all reads so far for each explanation of them, nats."""
+
+    body: Float[Array, " tag"]
+    stationary: Float[Array, " tag"]
+    free: Float[Array, " tag"]
 
 
 class Detection(eqx.Module):
     """Stage that decides which tags are detected. `Detection()` has good values."""
 
     temperature_nats: Positive
-    stationary: Float[Array, ""]  # prior log odds of a stationary tag against one on its body
-    elsewhere: Float[
-        Array, ""
-    ]  # prior log odds of a tag that has left its body; low: reflections change phases that fit
+    recent: Float[Array, ""]  # w_b
+    stationary: Float[Array, ""]  # w_s
+    free: Float[Array, ""]  # w_f
+    free_recent: Float[Array, ""]  # w_r
+    level: Float[Array, ""]  # c
+    moves_nats: Positive  # T_m
+    moves_level: Float[Array, ""]  # c_m: prior log odds of a stationary tag against one that moves
     fresh_s: Positive  # time constant of the reads' age
     threshold: float = eqx.field(static=True)  # confidence above which a tag is detected; no gradient reaches it
 
     def __init__(
         self,
         *,
-        temperature_nats: float = 2.0,
-        stationary: float = 1.3,
-        elsewhere: float = -4.0,
+        temperature_nats: float = 17.0,
+        recent: float = 0.3,
+        stationary: float = 0.35,
+        free: float = 0.55,
+        free_recent: float = 1.1,
+        level: float = 1.5,
+        moves_nats: float = 2.0,
+        moves_level: float = 1.3,
         fresh_s: float = 0.7,
-        threshold: float = 0.5,
+        threshold: float = 0.2,
     ) -> None:
         """Raises `ValueError` for a time or temperature that is not positive, or a threshold that is not between 0 and 1."""
-        self.temperature_nats, self.fresh_s = Positive(temperature_nats), Positive(fresh_s)
-        self.stationary, self.elsewhere = (jnp.asarray(odds, jnp.float32) for odds in (stationary, elsewhere))
+        self.temperature_nats, self.moves_nats = Positive(temperature_nats), Positive(moves_nats)
+        self.fresh_s = Positive(fresh_s)
+        self.recent, self.stationary = jnp.asarray(recent, jnp.float32), jnp.asarray(stationary, jnp.float32)
+        self.free, self.free_recent = jnp.asarray(free, jnp.float32), jnp.asarray(free_recent, jnp.float32)
+        self.level, self.moves_level = jnp.asarray(level, jnp.float32), jnp.asarray(moves_level, jnp.float32)
         if not 0.0 < threshold < 1.0:
             raise ValueError(f"threshold is {threshold}; expected a confidence strictly between 0 and 1.")
         self.threshold = float(threshold)
@@ -67,31 +90,27 @@ class Detection(eqx.Module):
         state: RecentReads,
         arrivals: Arrivals,
         added_nats: Float[Array, " tag"],
+        added_free_nats: Float[Array, " tag"],
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
     ) -> RecentReads:
-        """The recent reads after a frame; `added_nats` is what its reads, `arrivals`, are as evidence for each tag's body."""
+        """The recent reads after a frame; its reads, `arrivals`, add this evidence for each tag's body and for a free path."""
         fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / self.fresh_s.value)
         new = jax.ops.segment_sum(jnp.where(arrivals.valid, fresh, 0.0), arrivals.tag, state.number.shape[0])
         kept = jnp.exp(-(now_s - since_s) / self.fresh_s.value)
-        return RecentReads(number=kept * state.number + new, nats=kept * state.nats + added_nats)
+        return RecentReads(
+            number=kept * state.number + new,
+            nats=kept * state.nats + added_nats,
+            free_nats=kept * state.free_nats + added_free_nats,
+        )
 
-    def confidence(
-        self, body_nats: Float[Array, " tag"], stationary_nats: Float[Array, " tag"], recent: RecentReads
-    ) -> Float[Array, " tag"]:
-        """The probability that each tag is on its body, from the evidence for the hypotheses and the recent reads."""
-        return self.probabilities(body_nats, stationary_nats, recent)[0]
-
-    def probabilities(
-        self, body_nats: Float[Array, " tag"], stationary_nats: Float[Array, " tag"], recent: RecentReads
-    ) -> Float[Array, "4 tag"]:
-        """The probabilities that each tag is on its body, stationary, elsewhere, and that none of its reads is recent."""
-        temperature_nats = self.temperature_nats.value
-        stationary = (stationary_nats - body_nats) / temperature_nats + self.stationary
-        elsewhere = self.elsewhere - recent.nats / temperature_nats
-        level = jnp.stack([jnp.zeros_like(stationary), stationary, elsewhere])
-        explained = jax.nn.softmax(level, axis=0) * -jnp.expm1(-recent.number)[None]
-        return jnp.concatenate([explained, jnp.exp(-recent.number)[None]])
+    def confidence(self, nats: Explanations, recent: RecentReads) -> Float[Array, " tag"]:
+        """The confidence of each tag, 0 to 1, from the evidence and the recent reads."""
+        moves = (nats.body - nats.stationary) / self.moves_nats.value - self.moves_level
+        free, free_recent = jnp.maximum(nats.free, 0.0), jnp.maximum(recent.free_nats, 0.0)
+        rivals = self.stationary * nats.stationary + self.free * free + self.free_recent * free_recent
+        better = (nats.body + self.recent * recent.nats - rivals) / self.temperature_nats.value - self.level
+        return jax.nn.sigmoid(moves) * jax.nn.sigmoid(better) * -jnp.expm1(-recent.number)
 
     def detected(self, confidence: Float[Array, " tag"]) -> Bool[Array, " tag"]:
         """Whether the confidence exceeds the threshold."""
@@ -99,24 +118,21 @@ class Detection(eqx.Module):
 
     def status(
         self,
-        probabilities: Float[Array, "4 tag"],
+        nats: Explanations,
+        recent: RecentReads,
         detected: Bool[Array, " tag"],
         in_view: Bool[Array, " tag"],
         hidden: Bool[Array, " tag"],
     ) -> Int8[Array, " tag"]:
-        """`Status.DETECTED`, or the most probable reason against it; no gradient.
+        """`Status.DETECTED`, or the reason against it; no gradient.
 
-        `probabilities` are those of the method of this name, with the evidence of the last body where that is `hidden`.
-        `in_view` is whether some segment probably belongs to the body: without one, and not hidden, it is not found. A tag
-        that is elsewhere is occluded if its last body is hidden: so it is known where.
+        `nats` are those of `confidence`, with the evidence of the last body where that is `hidden`; `in_view` is whether
+        some segment probably belongs to the body. The reasons, in order: not even one read is recent (at even odds); the
+        tag explains its reads best as stationary; its last body is hidden; no body explains its reads well enough.
         """
-        body, stationary, elsewhere, unread = probabilities
-        reasons = {
-            Status.NOT_READ: unread,
-            Status.OCCLUDED: jnp.where(hidden, body + elsewhere, 0.0),
-            Status.STATIONARY: stationary,
-            Status.NOT_FOUND: jnp.where(hidden, 0.0, elsewhere + jnp.where(in_view, 0.0, body)),
-        }
-        codes = jnp.asarray(list(reasons), jnp.int8)
-        reason = codes[jnp.argmax(jnp.stack(list(reasons.values())), axis=0)]
+        # Before anything moves, the best body and the static background explain the reads alike.
+        stationary = (nats.stationary >= nats.free) & ((nats.stationary >= nats.body) | ~in_view)
+        reason = jnp.where(hidden, jnp.int8(Status.OCCLUDED), jnp.int8(Status.NOT_FOUND))
+        reason = jnp.where(stationary, jnp.int8(Status.STATIONARY), reason)
+        reason = jnp.where(recent.number < jnp.log(2.0), jnp.int8(Status.NOT_READ), reason)
         return jnp.where(detected, jnp.int8(Status.DETECTED), reason)

@@ -10,7 +10,7 @@ background: a tag that stays in place.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,6 +28,7 @@ _CHUNK = 8  # reads: valid ones come first in a frame's buffer, which is mostly 
 _FEW = 512  # segments: hardly ever more exist, after the first seconds
 
 _Rows = tuple[Array, Array, Array]
+ReadsT = TypeVar("ReadsT", bound=tuple[Any, ...])
 
 
 class DwellState(eqx.Module):
@@ -98,7 +99,7 @@ class DwellEvidence(eqx.Module):
         fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / memory_s)
 
         num_antennas, shape = increment_m.shape[0], state.real.shape
-        reads = _in_chunks((arrivals, fraction, fresh))
+        reads = in_chunks((arrivals, fraction, fresh))
         tables = tuple(table.reshape(-1, shape[-1]) for table in (state.real, state.imaginary, state.read_m))
         of_tags = tables, decay * state.log_likelihood
 
@@ -190,8 +191,8 @@ def inherited(
     return jnp.where(unknown[None], jnp.maximum(log_likelihood, 0.0), log_likelihood)
 
 
-def _in_chunks(reads: tuple[Arrivals, Array, Array]) -> tuple[Arrivals, Array, Array]:
-    """(chunk, _CHUNK) reads, with invalid ones at the end: a chunk of such reads costs nothing."""
+def in_chunks(reads: ReadsT) -> ReadsT:
+    """(chunk, _CHUNK) reads, the first of which are `Arrivals`, with invalid ones at the end: a chunk of such reads costs nothing."""
     more = -reads[0].valid.shape[0] % _CHUNK
     return jax.tree.map(lambda leaf: jnp.pad(leaf, (0, more)).reshape(-1, _CHUNK), reads)
 

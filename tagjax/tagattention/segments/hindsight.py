@@ -32,6 +32,7 @@ class Hindsight(eqx.Module):
     labels: Int[Array, "height width"]  # slot of each pixel, -1 = none
     evidence: Float[Array, "tag segment"]  # of the later reads, nats
     recent: RecentReads  # the next reads, each counted by its distance in time
+    free_nats: Float[Array, " tag"]  # evidence of the later reads for a path of the tag's own
     body: LaterBody | None
     member: Bool[Array, " segment"]  # belongs to some tag's body
 

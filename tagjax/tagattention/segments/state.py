@@ -14,6 +14,7 @@ from .attention import AttentionState
 from .body import BodyState
 from .detection import RecentReads
 from .dwell import DwellState
+from .free_path import FreePathState
 from .hidden import HiddenState
 from .step import SegmentTrackerState
 from .travel import TravelState
@@ -28,6 +29,7 @@ class TagState(eqx.Module):
     attention: AttentionState | None
     body: BodyState | None
     hidden: HiddenState | None
+    free: FreePathState | None
     recent: RecentReads
 
 
@@ -47,7 +49,7 @@ def last_s(state: TagState, frame: Frame) -> Float[Array, ""]:
 
 def of_tags(state: TagState) -> list[Any]:
     """The arrays with one row a tag."""
-    found = [*jax.tree.leaves(state.recent), *jax.tree.leaves(state.hidden)]
+    found = [*jax.tree.leaves(state.recent), *jax.tree.leaves(state.hidden), *jax.tree.leaves(state.free)]
     if state.dwell is not None:
         dwell = state.dwell
         found += [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
@@ -59,6 +61,8 @@ def of_tags(state: TagState) -> list[Any]:
 def times(state: TagState) -> list[Any]:
     """The arrays of times."""
     found = [state.time_s]
+    if state.free is not None:
+        found.append(state.free.time_s)
     if state.travel is not None:
         found.append(state.travel.past.time_s)
     if state.attention is not None:

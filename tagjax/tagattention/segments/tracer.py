@@ -8,7 +8,8 @@ A frame passes through them in this order:
 4. `body`: evidence and motion in space -> which segments belong to the rigid body that carries the tag;
 5. `whole`: what is connected with a body that walks, and gets on as it does -> the whole of it;
 6. `hidden`: the last body -> its evidence where it comes out again, and whether the tag is out of view;
-7. `detection`: evidence for that body, and how recent it is -> the probability that the tag is on it.
+7. `free`: the reads -> evidence for a path that nothing in view follows;
+8. `detection`: evidence for that body, against its rivals, and how recent it is -> the confidence that the tag is on it.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody, LaterBody
 from .cells import row_sources
 from .cut import cut_segments
-from .detection import Detection, RecentReads
+from .detection import Detection, Explanations, RecentReads
 from .dwell import DwellEvidence, DwellState, inherited
+from .free_path import FreePath, FreePathState
 from .given import without_joined
 from .hidden import HiddenBody, HiddenState
 from .hindsight import Hindsight
@@ -63,6 +65,7 @@ class Association(eqx.Module):
         Array, " tag"
     ]  # evidence of the reads that the tag moves with the body, against phases at random; 0 without
     stationary_nats: Float[Array, " tag"]  # ... that it is stationary
+    free_nats: Float[Array, " tag"]  # ... that it moves on a path of its own; 0 without the stage
     recent: RecentReads
     confidence: Float[Array, " tag"]
     detected: Bool[Array, " tag"]
@@ -82,7 +85,7 @@ class TagAttention(AbstractSmoother):
     """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values.
 
     None is a stage that is off. Without `body` the segments that explain the reads best are the object (`cut_segments`).
-    Raises `ValueError` without any evidence, for `hidden`, which remembers dwells, without them, and for `whole` without
+    Raises `ValueError` without any evidence, for `hidden` and `free`, which need dwells, without them, and for `whole` without
     a body to complete.
     """
 
@@ -94,6 +97,7 @@ class TagAttention(AbstractSmoother):
     body: CarryingBody | None = eqx.field(default_factory=CarryingBody)
     whole: WholeBody | None = eqx.field(default_factory=WholeBody)
     hidden: HiddenBody | None = eqx.field(default_factory=HiddenBody)
+    free: FreePath | None = eqx.field(default_factory=FreePath)
     detection: Detection = eqx.field(default_factory=Detection)
 
     def __check_init__(self) -> None:
@@ -101,6 +105,8 @@ class TagAttention(AbstractSmoother):
             raise ValueError("dwell and attention are both off; expected at least one: nothing else uses the reads.")
         if self.hidden is not None and self.dwell is None:
             raise ValueError("hidden is on and dwell is off; expected dwell for it. Set hidden to null.")
+        if self.free is not None and self.dwell is None:
+            raise ValueError("free is on and dwell is off; expected dwell, whose memory it shares. Set free to null.")
         if self.whole is not None and self.body is None:
             raise ValueError("whole is on and body is off; expected a body that it completes. Set whole to null.")
 
@@ -130,6 +136,7 @@ class TagAttention(AbstractSmoother):
             attention=attention,
             body=None if self.body is None else self.body.init(num_tags, num_segments),
             hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
+            free=None if self.free is None else self.free.init(num_tags, num_antennas),
             recent=RecentReads.nothing(num_tags),
         )
 
@@ -193,6 +200,7 @@ class TagAttention(AbstractSmoother):
             labels=found.labels,
             evidence=evidence,
             recent=tags.recent,
+            free_nats=jnp.zeros(out.confidence.shape) if tags.free is None else tags.free.log_likelihood,
             body=None if tags.body is None else LaterBody(tags.body.membership, tags.body.fastest_m_s),
             member=jnp.any(out.membership > 0.5, axis=0),
         )
@@ -244,24 +252,31 @@ class TagAttention(AbstractSmoother):
             unseen = self.hidden.out_of_view(camera, hidden, frame.depth_m, found.labels, membership, dt_s)
             hidden, remembered = self.hidden.step(hidden, own_nats, some, centre_m, velocity_m_s, kept, dt_s)
             hides = remembered & unseen
-        recent = self.detection.received(state.recent, frame.arrivals, added_nats, since_s, now_s)
+        free, free_nats, free_added = self._free(state, frame, since_s)
+        recent = self.detection.received(state.recent, frame.arrivals, added_nats, free_added, since_s, now_s)
         around = recent if later is None else jax.tree.map(jnp.add, recent, later.recent)
-        confidence = self.detection.confidence(body_nats, evidence[:, STATIC], around)
+        if later is not None:
+            free_nats = free_nats + later.free_nats
+        nats = Explanations(body_nats, evidence[:, STATIC], free_nats)
+        confidence = self.detection.confidence(nats, around)
         in_view = jnp.any(membership > 0.5, axis=1)
         confidence = jnp.where(frame.present & in_view & ~hides, confidence, 0.0)
         detected = self.detection.detected(confidence)
-        last_nats, stationary_nats = body_nats, evidence[:, STATIC]
+        reasons = nats
         if hidden is not None:  # remembered by the reads up to this frame
-            last_nats = jnp.where(hides, hidden.evidence_nats, body_nats)
-            stationary_nats = jnp.where(hides, own[:, STATIC], stationary_nats)
-        terms = self.detection.probabilities(last_nats, stationary_nats, around)
-        status = self.detection.status(terms, detected, in_view, hides)
-        return TagState(now_s, travel, dwell, attention, body, hidden, recent), Association(
+            reasons = Explanations(
+                body=jnp.where(hides, hidden.evidence_nats, nats.body),
+                stationary=jnp.where(hides, own[:, STATIC], nats.stationary),
+                free=nats.free,
+            )
+        status = self.detection.status(reasons, around, detected, in_view, hides)
+        return TagState(now_s, travel, dwell, attention, body, hidden, free, recent), Association(
             membership=membership,
             centre_m=centre_m,
             step_m=mean(found.increment_m.T),
             body_nats=body_nats,
-            stationary_nats=evidence[:, STATIC],
+            stationary_nats=nats.stationary,
+            free_nats=nats.free,
             recent=around,
             confidence=confidence,
             detected=detected,
@@ -297,6 +312,19 @@ class TagAttention(AbstractSmoother):
             )
             evidence = evidence + self.attention.weight.value * agreed
         return dwell, attention, evidence, added
+
+    def _free(
+        self, state: TagState, frame: Frame, since_s: Float[Array, ""]
+    ) -> tuple[FreePathState | None, Float[Array, " tag"], Float[Array, " tag"]]:
+        """The state of the free paths, their evidence, and what this frame's reads have added to it; 0 without the stage."""
+        if self.free is None or state.free is None or self.dwell is None:
+            nothing = jnp.zeros(state.recent.number.shape)
+            return None, nothing, nothing
+        assert frame.arrivals is not None
+        after, added = self.free.step(
+            self.reader, state.free, frame.arrivals, self.dwell.memory_s.value, since_s, frame.time_s
+        )
+        return after, after.log_likelihood, added
 
     def _bodies(
         self,

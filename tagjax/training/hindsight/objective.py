@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from ...core.numerics import safe_divide
 from ...core.settings import ConfigError
 from ...tagattention.segments import Detection, TagAttention
-from ...tagattention.segments.detection import RecentReads
+from ...tagattention.segments.detection import Explanations, RecentReads
 from ...tracing.tracer import AbstractTracer, Camera
 from ..fading import faded
 from .pieces import PieceFrames, frame_of
@@ -81,12 +81,11 @@ class _Apart(eqx.Module):
 
     stage: Detection
 
-    def received(self, state: RecentReads, arrivals: Any, added_nats: Array, *times_s: Array) -> RecentReads:
-        return self.stage.received(state, arrivals, jax.lax.stop_gradient(added_nats), *times_s)
+    def received(self, state: RecentReads, arrivals: Any, *given: Array) -> RecentReads:
+        return self.stage.received(state, arrivals, *jax.lax.stop_gradient(given))
 
-    def confidence(self, body_nats: Array, stationary_nats: Array, recent: RecentReads) -> Array:
-        nats = jax.lax.stop_gradient((body_nats, stationary_nats))
-        return self.stage.confidence(*nats, recent)
+    def confidence(self, nats: Explanations, recent: RecentReads) -> Array:
+        return self.stage.confidence(jax.lax.stop_gradient(nats), recent)
 
     def __getattr__(self, name: str) -> Any:  # of the status, which has no gradient
         return getattr(self.stage, name)
