@@ -107,7 +107,7 @@ def test_the_loss_is_that_of_the_masks(piece: Piece) -> None:
             either = np.sum((membership[time, tag] + target[time, tag]) * area[time]) - both
             if sure[time, tag] > 0.9 and np.sum(target[time, tag] * area[time]) > 0:
                 missed.append(1 - both / either)
-                wrong.append((confidence[time, tag] - both / either) ** 2)
+                wrong.append((confidence[time, tag] - (both / either > 0.5)) ** 2)
                 num_there += 1
             elif sure[time, tag] < 0.1:
                 claimed.append(confidence[time, tag])

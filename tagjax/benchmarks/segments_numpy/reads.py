@@ -90,8 +90,8 @@ class Dwells:
         since_s: np.float32,
         now_s: np.float32,
         exists: Bool[np.ndarray, " segment"],
-    ) -> tuple[Float[np.ndarray, "tag segment"], Float[np.ndarray, "tag segment"]]:
-        """The evidence after a frame, nats (the state's own array), and what its reads have added."""
+    ) -> Float[np.ndarray, "tag segment"]:
+        """The evidence after a frame, nats: the state's own array."""
         new = np.flatnonzero(source > -2)
         new = new[new > 0]
         old = np.maximum(source[new], 0)
@@ -100,7 +100,6 @@ class Dwells:
         self.log_likelihood *= np.exp(-(now_s - since_s) / self.memory_s)
         unknown = new[source[new] <= 0]
         self.log_likelihood[:, unknown] = np.maximum(self.log_likelihood[:, unknown], 0)
-        before = self.log_likelihood.copy()
         increment_m = increment_m.copy()
         increment_m[:, 0] = 0
         # A frame without depth shows no segment, but they are there.
@@ -108,7 +107,7 @@ class Dwells:
         for at in _rounds(arrivals["tag"], arrivals["valid"]):
             self._add(at, slots, arrivals, increment_m, depth_m, since_s, now_s)
         self.distance_m += increment_m
-        return self.log_likelihood, self.log_likelihood - before
+        return self.log_likelihood
 
     def _add(
         self,
@@ -197,29 +196,27 @@ class Confidence:
     def __init__(self, settings: Detection, num_tags: int) -> None:
         self.settings, self.fresh_s = settings, np.float32(settings.fresh_s.value)
         self.threshold, self.num_reads = np.float32(settings.threshold), np.zeros(num_tags, np.float32)
-        self.recent_nats, self.recent_free_nats = np.zeros(num_tags, np.float32), np.zeros(num_tags, np.float32)
+        self.recent_free_nats = np.zeros(num_tags, np.float32)
 
     def received(
         self,
         arrivals: Reads,
-        added_nats: np.ndarray,
         added_free_nats: np.ndarray,
         since_s: np.float32,
         now_s: np.float32,
     ) -> None:
-        """Count a frame's reads, and what they add to the evidence for each tag's body and for a free path."""
+        """Count a frame's reads, and what they add to the evidence for a free path."""
         fresh = np.exp(-np.maximum(now_s - arrivals["time_s"], 0) / self.fresh_s)
         new = np.bincount(arrivals["tag"], np.where(arrivals["valid"], fresh, 0), len(self.num_reads))
         kept = np.exp(-(now_s - since_s) / self.fresh_s)
         self.num_reads = self.num_reads * kept + new.astype(np.float32)
-        self.recent_nats = self.recent_nats * kept + added_nats
         self.recent_free_nats = self.recent_free_nats * kept + added_free_nats
 
     def of(self, body_nats: np.ndarray, stationary_nats: np.ndarray, free_nats: np.ndarray) -> np.ndarray:
         """The confidence of each tag, from the evidence (tag) for each explanation of its reads."""
         one = self.settings
         moves = (body_nats - stationary_nats) / np.float32(one.moves_nats.value) - float(one.moves_level)
-        better = body_nats + float(one.recent) * self.recent_nats - float(one.stationary) * stationary_nats
+        better = body_nats - float(one.stationary) * stationary_nats
         free, free_recent = np.maximum(free_nats, 0), np.maximum(self.recent_free_nats, 0)
         better -= float(one.free) * free + float(one.free_recent) * free_recent
         odds = better / np.float32(one.temperature_nats.value) - float(one.level)

@@ -133,7 +133,7 @@ class NumpyTracer:
         dt_s = now_s - since_s
         pooling = None if self.travel is None else self.travel.step(found, dt_s, now_s)
         arrivals = {name: np.asarray(values) for name, values in vars(frame.arrivals).items()}
-        nats, added = self.dwells.step(
+        nats = self.dwells.step(
             arrivals, found.increment_m, found.centre_m[:, 2], found.source, since_s, now_s, found.exists
         )
         if self.hidden is not None:
@@ -153,7 +153,7 @@ class NumpyTracer:
         mass = at_place.sum(axis=1)
         some = (total > 0) & (mass > 0)
         share = at_place / np.where(some, mass, np.float32(1))[:, None]
-        body_nats, added_nats = (np.einsum("ts,ts->t", share, one) for one in (nats, added))
+        body_nats = np.einsum("ts,ts->t", share, nats)
         hides = np.zeros(len(total), bool)
         if self.hidden is not None:
             centre_m, motion_m = weight @ found.centre_m / divisor, weight @ found.motion_m / divisor
@@ -165,7 +165,7 @@ class NumpyTracer:
         if self.free is not None:
             free_added = self.free.step(arrivals, self.dwells.memory_s, since_s, now_s)
             free_nats = self.free.log_likelihood
-        self.confidence.received(arrivals, added_nats, free_added, since_s, now_s)
+        self.confidence.received(arrivals, free_added, since_s, now_s)
         confidence = self.confidence.of(body_nats, nats[:, STATIC], free_nats)
         shown = present & (membership > 0.5).any(axis=1) & ~hides
         return membership, np.where(shown, confidence, np.float32(0))

@@ -6,12 +6,12 @@ segments explains any reads fairly well. So the body counts by what it explains 
 
     confidence = p_moves p_body (1 - exp(-n))
     p_moves = sigmoid((E_b - E_s) / T_m - c_m)
-    p_body = sigmoid((E_b + w_b R_b - w_s E_s - w_f max(E_f, 0) - w_r max(R_f, 0)) / T - c) .
+    p_body = sigmoid((E_b - w_s E_s - w_f max(E_f, 0) - w_r max(R_f, 0)) / T - c) .
 
-R_b and R_f are the parts of E_b and E_f from recent reads, and n is their number: each counts as exp(-age / fresh_s). What was
-read seconds ago says little of where the tag is now; at least one read is recent with probability 1 - exp(-n). The
-weights are learned without labels: the confidence should be the IoU of the mask with the smoother's, and 0 for reads that
-belong to nothing in view. So it is an IoU to be expected, and a tag is detected at far less than one half.
+R_f is the part of E_f from recent reads, and n is their number: each counts as exp(-age / fresh_s). What was read seconds ago
+says little of where the tag is now; at least one read is recent with probability 1 - exp(-n). The weights are learned
+without labels: the confidence should be 1 where the mask is the smoother's, and 0 where it is not, and for reads that belong
+to nothing in view, which are taken to be one tenth of all.
 """
 
 from __future__ import annotations
@@ -30,13 +30,12 @@ class RecentReads(eqx.Module):
     """What each tag's recent reads amount to; each counts as `Detection` says."""
 
     number: Float[Array, " tag"]
-    nats: Float[Array, " tag"]  # evidence for the tag's body
-    free_nats: Float[Array, " tag"]  # ... for a free path
+    free_nats: Float[Array, " tag"]  # evidence for a free path
 
     @staticmethod
     def nothing(num_tags: int) -> RecentReads:
         """Before the first read."""
-        return RecentReads(*(jnp.zeros(num_tags) for _ in range(3)))
+        return RecentReads(jnp.zeros(num_tags), jnp.zeros(num_tags))
 
 
 class Explanations(eqx.Module):
@@ -51,7 +50,6 @@ class Detection(eqx.Module):
     """Stage that decides which tags are detected. `Detection()` has good values."""
 
     temperature_nats: Positive
-    recent: Float[Array, ""]  # w_b
     stationary: Float[Array, ""]  # w_s
     free: Float[Array, ""]  # w_f
     free_recent: Float[Array, ""]  # w_r
@@ -64,23 +62,23 @@ class Detection(eqx.Module):
     def __init__(
         self,
         *,
-        temperature_nats: float = 17.0,
-        recent: float = 0.3,
-        stationary: float = 0.35,
-        free: float = 0.55,
-        free_recent: float = 1.1,
-        level: float = 1.5,
+        temperature_nats: float = 16.0,
+        stationary: float = 0.4,
+        free: float = 0.5,
+        free_recent: float = 0.8,
+        level: float = 0.5,
         moves_nats: float = 2.0,
         moves_level: float = 1.3,
         fresh_s: float = 0.7,
-        threshold: float = 0.2,
+        threshold: float = 0.5,
     ) -> None:
         """Raises `ValueError` for a time or temperature that is not positive, or a threshold that is not between 0 and 1."""
         self.temperature_nats, self.moves_nats = Positive(temperature_nats), Positive(moves_nats)
         self.fresh_s = Positive(fresh_s)
-        self.recent, self.stationary = jnp.asarray(recent, jnp.float32), jnp.asarray(stationary, jnp.float32)
-        self.free, self.free_recent = jnp.asarray(free, jnp.float32), jnp.asarray(free_recent, jnp.float32)
-        self.level, self.moves_level = jnp.asarray(level, jnp.float32), jnp.asarray(moves_level, jnp.float32)
+        weights = stationary, free, free_recent, level, moves_level
+        self.stationary, self.free, self.free_recent, self.level, self.moves_level = (
+            jnp.asarray(weight, jnp.float32) for weight in weights
+        )
         if not 0.0 < threshold < 1.0:
             raise ValueError(f"threshold is {threshold}; expected a confidence strictly between 0 and 1.")
         self.threshold = float(threshold)
@@ -89,18 +87,16 @@ class Detection(eqx.Module):
         self,
         state: RecentReads,
         arrivals: Arrivals,
-        added_nats: Float[Array, " tag"],
         added_free_nats: Float[Array, " tag"],
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
     ) -> RecentReads:
-        """The recent reads after a frame; its reads, `arrivals`, add this evidence for each tag's body and for a free path."""
+        """The recent reads after a frame; its reads, `arrivals`, add this evidence for a free path."""
         fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / self.fresh_s.value)
         new = jax.ops.segment_sum(jnp.where(arrivals.valid, fresh, 0.0), arrivals.tag, state.number.shape[0])
         kept = jnp.exp(-(now_s - since_s) / self.fresh_s.value)
         return RecentReads(
             number=kept * state.number + new,
-            nats=kept * state.nats + added_nats,
             free_nats=kept * state.free_nats + added_free_nats,
         )
 
@@ -109,7 +105,7 @@ class Detection(eqx.Module):
         moves = (nats.body - nats.stationary) / self.moves_nats.value - self.moves_level
         free, free_recent = jnp.maximum(nats.free, 0.0), jnp.maximum(recent.free_nats, 0.0)
         rivals = self.stationary * nats.stationary + self.free * free + self.free_recent * free_recent
-        better = (nats.body + self.recent * recent.nats - rivals) / self.temperature_nats.value - self.level
+        better = (nats.body - rivals) / self.temperature_nats.value - self.level
         return jax.nn.sigmoid(moves) * jax.nn.sigmoid(better) * -jnp.expm1(-recent.number)
 
     def detected(self, confidence: Float[Array, " tag"]) -> Bool[Array, " tag"]:

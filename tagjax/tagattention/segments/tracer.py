@@ -29,10 +29,9 @@ from ...tracing.status import Status
 from ...tracing.tracer import AbstractSmoother, Camera, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody, LaterBody
-from .cells import row_sources
 from .cut import cut_segments
 from .detection import Detection, Explanations, RecentReads
-from .dwell import DwellEvidence, DwellState, inherited
+from .dwell import DwellEvidence, DwellState
 from .free_path import FreePath, FreePathState
 from .given import without_joined
 from .hidden import HiddenBody, HiddenState
@@ -224,7 +223,7 @@ class TagAttention(AbstractSmoother):
         travel, pooling = state.travel, None
         if self.travel is not None and travel is not None:
             travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
-        dwell, attention, own, added = self._evidence(state, found, pooling, frame)
+        dwell, attention, own = self._evidence(state, found, pooling, frame)
         later: Hindsight | None = frame.backward_message
         evidence, later_body = own, None
         if later is not None:
@@ -242,9 +241,7 @@ class TagAttention(AbstractSmoother):
         at_place = membership * place
         mass = jnp.sum(at_place, axis=1)
         some = (total > 0) & (mass > 0)
-        body_nats, own_nats, added_nats = (
-            safe_divide(jnp.sum(at_place * nats, axis=1), mass) for nats in (evidence, own, added)
-        )
+        body_nats, own_nats = (safe_divide(jnp.sum(at_place * nats, axis=1), mass) for nats in (evidence, own))
         centre_m, hidden, hides = mean(found.centre_m), state.hidden, jnp.zeros(total.shape, bool)
         if self.hidden is not None and hidden is not None and self.dwell is not None:
             velocity_m_s = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
@@ -253,7 +250,7 @@ class TagAttention(AbstractSmoother):
             hidden, remembered = self.hidden.step(hidden, own_nats, some, centre_m, velocity_m_s, kept, dt_s)
             hides = remembered & unseen
         free, free_nats, free_added = self._free(state, frame, since_s)
-        recent = self.detection.received(state.recent, frame.arrivals, added_nats, free_added, since_s, now_s)
+        recent = self.detection.received(state.recent, frame.arrivals, free_added, since_s, now_s)
         around = recent if later is None else jax.tree.map(jnp.add, recent, later.recent)
         if later is not None:
             free_nats = free_nats + later.free_nats
@@ -285,22 +282,19 @@ class TagAttention(AbstractSmoother):
 
     def _evidence(
         self, state: TagState, found: SegmentFrame, pooling: Pooling | None, frame: Frame
-    ) -> tuple[DwellState | None, AttentionState | None, Float[Array, "tag segment"], Float[Array, "tag segment"]]:
-        """The states of the stages that use reads, their evidence, and what this frame's reads have added to that of dwells."""
+    ) -> tuple[DwellState | None, AttentionState | None, Float[Array, "tag segment"]]:
+        """The states of the stages that use reads, and their evidence."""
         assert frame.arrivals is not None
         assert frame.present is not None
-        now_s, since_s, source = frame.time_s, last_s(state, frame), row_sources(found.source)
+        now_s, since_s = frame.time_s, last_s(state, frame)
         dt_s = now_s - since_s
         dwell, attention = state.dwell, state.attention
-        evidence = added = jnp.zeros((frame.present.shape[0], found.area.shape[0]))
+        evidence = jnp.zeros((frame.present.shape[0], found.area.shape[0]))
         if self.dwell is not None and dwell is not None:
-            before = jnp.exp(-dt_s / self.dwell.memory_s.value) * jnp.take(dwell.log_likelihood, source, axis=1)
-            before = inherited(before, found.source)
             dwell, evidence = self.dwell.step(
                 self.reader, dwell, frame.arrivals, found.increment_m, found.centre_m[:, 2], found.source,
                 since_s, now_s, found.area > 0,
             )  # fmt: skip
-            added = evidence - before
             if self.hidden is not None and state.hidden is not None:
                 evidence = self.hidden.inherited(state.hidden, evidence, found.centre_m, found.source > -2)
             if self.travel is not None and pooling is not None:
@@ -311,7 +305,7 @@ class TagAttention(AbstractSmoother):
                 attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
             )
             evidence = evidence + self.attention.weight.value * agreed
-        return dwell, attention, evidence, added
+        return dwell, attention, evidence
 
     def _free(
         self, state: TagState, frame: Frame, since_s: Float[Array, ""]

@@ -20,6 +20,8 @@ from ..fading import faded
 from .pieces import PieceFrames, frame_of
 from .teachers import Teacher
 
+_RIGHT = 0.5  # IoU above which a mask counts as right
+
 
 @dataclasses.dataclass(frozen=True)
 class HindsightSettings:
@@ -70,7 +72,7 @@ class HindsightSums(NamedTuple):
     """Sums over the tag-frames of which the teacher is sure, and their numbers."""
 
     missed: Float[Array, ""]  # 1 - IoU where the teacher sees the object
-    wrong: Float[Array, ""]  # (confidence - IoU)^2 everywhere; the IoU is 0 where the teacher sees nothing
+    wrong: Float[Array, ""]  # (confidence - 1)^2 where the IoU is above one half, confidence^2 elsewhere
     claimed: Float[Array, ""]  # confidence where it sees nothing
     num_there: Float[Array, ""]
     num_away: Float[Array, ""]
@@ -96,10 +98,10 @@ def hindsight_sums(
 ) -> HindsightSums:
     """The two questions of each tag-frame: where the object is, and how sure one may be of it.
 
-    IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should say
-    this IoU: its squared error is least where it is the IoU that is to be expected (a proper score; Brier, 1950), so that no
-    share of frames with and without an object makes it too sure. The IoU carries no gradient there, nor does what detection
-    is given: so the mask teaches every stage but detection, and the confidence teaches detection alone.
+    IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should be
+    the probability that the mask is right, that is, of an IoU above one half: its squared error is least where it is (a
+    proper score; Brier, 1950). That carries no gradient to the mask, nor does what detection is given: so the mask teaches
+    every stage but detection, and the confidence teaches detection alone.
     """
     tracer = eqx.tree_at(lambda one: one.detection, tracer, replace_fn=_Apart)
     num_antennas, num_tags = camera.antennas_m.shape[0], frames.present.shape[1]
@@ -118,8 +120,8 @@ def hindsight_sums(
     _, (overlap, confidence, size) = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), state, frames)
     there = frames.present & (frames.confidence > settings.sure) & (size > 0)
     away = frames.present & (frames.confidence < 1.0 - settings.sure)
-    expected = jax.lax.stop_gradient(jnp.where(there, overlap, 0.0))
-    wrong = jnp.where(there | away, (confidence - expected) ** 2, 0.0)
+    right = jnp.where(there & (overlap > _RIGHT), 1.0, 0.0)
+    wrong = jnp.where(there | away, (confidence - right) ** 2, 0.0)
 
     return HindsightSums(
         missed=jnp.sum(jnp.where(there, 1.0 - overlap, 0.0)),
