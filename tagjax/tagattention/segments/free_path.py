@@ -15,6 +15,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...core.parameters import check_positive
@@ -77,8 +78,8 @@ class FreePath(eqx.Module):
 
         Evidence decays as that of bodies does, by exp(-age / memory_s). Cost: reads x speeds^2, for their diffusion.
         """
-        ends = jnp.asarray([-self.max_speed_m_s, self.max_speed_m_s], arrivals.time_s.dtype)
-        speed_m_s = jnp.linspace(*ends, self.num_speeds)
+        speeds = np.linspace(-self.max_speed_m_s, self.max_speed_m_s, self.num_speeds)
+        speed_m_s = jnp.asarray(speeds, arrivals.time_s.dtype)
         apart2 = jnp.square(speed_m_s[:, None] - speed_m_s[None])
         fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / memory_s)
 
@@ -92,10 +93,9 @@ class FreePath(eqx.Module):
             spread = jnp.exp(-0.5 * apart2 / jnp.square(walk_m_s))
             probability = (spread / jnp.sum(spread, axis=0, keepdims=True)) @ state.probability[at]
             goes_on = read.channel == state.channel[at]
-            phasor = (jnp.where(goes_on, row[at], 0.0) for row in (state.real, state.imaginary))
-            real, imaginary = reader.moved(
-                *phasor, speed_m_s * gap_s, jnp.asarray(_DEPTH_M, gap_s.dtype), read.carrier_hz
-            )
+            real, imaginary = (jnp.where(goes_on, row[at], 0.0) for row in (state.real, state.imaginary))
+            depth_m = jnp.asarray(_DEPTH_M, gap_s.dtype)
+            real, imaginary = reader.moved(real, imaginary, speed_m_s * gap_s, depth_m, read.carrier_hz)
             concentration = reader.concentration(read.rssi_dbm, speed_m_s)
             evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
             explained = probability * jnp.exp(evidence)  # bounded: an outlier has log(q), and i0e(after) is at most 1
