@@ -52,7 +52,7 @@ def test_the_confidence_is_what_the_body_explains_better_than_its_rivals():
     body, still, free = np.array([60.0, 30.0, -30.0]), np.array([4.0, 20.0, -60.0]), np.array([40.0, 0.0, 9.0])
     number, free_nats = np.array([3.0, 50.0, 20.0]), np.array([5.0, -1.0, 3.0])
     found = detection.confidence(evidence(body, still, free), recent(number, free_nats))
-    better = body - 0.25 * still - 0.75 * free - 2 * np.maximum(free_nats, 0)
+    better = body - 0.25 * np.minimum(still, 0) - 0.75 * free - 2 * np.maximum(free_nats, 0)
     expected = expit((body - still) / 3 - 0.5) * expit(better / 5 - 1) * (1 - np.exp(-number))
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
@@ -61,7 +61,7 @@ def test_each_rival_that_explains_the_reads_lowers_the_confidence():
     detection, reads = Detection(), recent([20.0], [10.0])
     alone = float(detection.confidence(evidence([80.0], [-90.0], [10.0]), reads)[0])
     assert alone > 0.8
-    assert float(detection.confidence(evidence([80.0], [60.0], [10.0]), reads)[0]) < alone - 0.02
+    assert float(detection.confidence(evidence([80.0], [78.0], [10.0]), reads)[0]) < alone - 0.02
     assert float(detection.confidence(evidence([80.0], [-90.0], [90.0]), reads)[0]) < alone - 0.02
     free_of_late = recent([20.0], [60.0])
     assert float(detection.confidence(evidence([80.0], [-90.0], [10.0]), free_of_late)[0]) < alone - 0.02

@@ -216,7 +216,7 @@ class Confidence:
         """The confidence of each tag, from the evidence (tag) for each explanation of its reads."""
         one = self.settings
         moves = (body_nats - stationary_nats) / np.float32(one.moves_nats.value) - float(one.moves_level)
-        better = body_nats - float(one.stationary) * stationary_nats
+        better = body_nats - float(one.stationary) * np.minimum(stationary_nats, 0)
         free, free_recent = np.maximum(free_nats, 0), np.maximum(self.recent_free_nats, 0)
         better -= float(one.free) * free + float(one.free_recent) * free_recent
         odds = better / np.float32(one.temperature_nats.value) - float(one.level)

@@ -6,9 +6,9 @@ segments explains any reads fairly well. So the body counts by what it explains 
 
     confidence = p_moves p_body (1 - exp(-n))
     p_moves = sigmoid((E_b - E_s) / T_m - c_m)
-    p_body = sigmoid((E_b - w_s E_s - w_f max(E_f, 0) - w_r max(R_f, 0)) / T - c) .
+    p_body = sigmoid((E_b - w_s min(E_s, 0) - w_f max(E_f, 0) - w_r max(R_f, 0)) / T - c) .
 
-R_f is the part of E_f from recent reads, and n is their number: each counts as exp(-age / fresh_s). What was read seconds ago
+A tag that surely moves (E_s < 0) needs less evidence for its body. R_f is the part of E_f from recent reads, and n is their number: each counts as exp(-age / fresh_s). What was read seconds ago
 says little of where the tag is now; at least one read is recent with probability 1 - exp(-n). The weights are learned
 without labels: the confidence should be 1 where the mask is the smoother's, and 0 where it is not, and for reads that belong
 to nothing in view, which are taken to be one tenth of all.
@@ -62,11 +62,11 @@ class Detection(eqx.Module):
     def __init__(
         self,
         *,
-        temperature_nats: float = 16.0,
-        stationary: float = 0.4,
-        free: float = 0.5,
-        free_recent: float = 0.8,
-        level: float = 0.5,
+        temperature_nats: float = 20.0,
+        stationary: float = 0.5,
+        free: float = 0.65,
+        free_recent: float = 1.0,
+        level: float = 0.3,
         moves_nats: float = 2.0,
         moves_level: float = 1.3,
         fresh_s: float = 0.7,
@@ -104,7 +104,7 @@ class Detection(eqx.Module):
         """The confidence of each tag, 0 to 1, from the evidence and the recent reads."""
         moves = (nats.body - nats.stationary) / self.moves_nats.value - self.moves_level
         free, free_recent = jnp.maximum(nats.free, 0.0), jnp.maximum(recent.free_nats, 0.0)
-        rivals = self.stationary * nats.stationary + self.free * free + self.free_recent * free_recent
+        rivals = self.stationary * jnp.minimum(nats.stationary, 0.0) + self.free * free + self.free_recent * free_recent
         better = (nats.body - rivals) / self.temperature_nats.value - self.level
         return jax.nn.sigmoid(moves) * jax.nn.sigmoid(better) * -jnp.expm1(-recent.number)
 
