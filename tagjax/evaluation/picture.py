@@ -69,7 +69,7 @@ def make_picture(config: PictureConfig, *, on_progress: OnProgress = unobserved)
     for number, trace in traced.traces(on_progress):
         if first <= number < last:
             time_s = float(frame_s[number - first])
-            video.append(_overlay(traced, number, trace, round(_VIDEO * config.width), caption=f"{time_s:.1f} s"))
+            video.append(frame_overlay(traced, number, trace, round(_VIDEO * config.width), caption=f"{time_s:.1f} s"))
             ranges_m.append(_ranges_m(traced, trace))
     curves = tag_curves(traced, (first, last), np.stack(ranges_m))
     height, width = video[0].shape[:2]
@@ -136,7 +136,7 @@ def _ranges_m(traced: Traced, trace: Trace) -> Float64[np.ndarray, " tag"]:
     return np.where(np.asarray(trace.detected), range_m, np.nan)
 
 
-def _overlay(
+def frame_overlay(
     traced: Traced, number: int, trace: Trace, width: int, *, caption: str
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """The overlay of a frame, enlarged to `width` before lines and text are drawn."""
