@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import math
 import struct
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 from capture_scenes import EMULATORS, ORIGIN_NS, QUICK, Taken, connect, keys, reads_table, take
 
+from tagjax.core.errors import RecordingError
 from tagjax.recording.capture.emulation import EmulatorSettings
 from tagjax.recording.capture.llrp import LlrpReader, captured_read
 from tagjax.recording.capture.r700 import LineSplitter, R700Reader, TlsSettings, captured_line
@@ -59,6 +62,35 @@ def test_reads_through_sockets_are_those_of_the_recording(kind: str) -> None:
     # The reader's clock: 200 ppm too fast, an hour behind, in whole microseconds.
     shown = (found.reader_time_ns - true_ns) * 1e-9 + 3600.0
     np.testing.assert_allclose(shown, (true_ns - true_ns[0] + table.time_ns[0] - ORIGIN_NS) * 2e-13, atol=2e-6)
+
+
+@BOTH
+def test_a_begin_that_is_noticed_late_loses_no_read(kind: str) -> None:
+    """The loop stands still when the playback begins, as on a busy machine."""
+    table = reads_table(0.3, 450.0)
+
+    async def test() -> Taken:
+        async with EMULATORS[kind](table, ORIGIN_NS) as emulator:
+            taken, begin = Taken(), emulator.start.begin
+
+            def late() -> None:
+                begin()
+                time.sleep(0.3)
+
+            emulator.start.begin = late
+            return await take(
+                connect(emulator), lambda one: len(one.reads) >= table.num_reads, start=emulator.start, taken=taken
+            )
+
+    assert len(run(test(), 5.0).reads) == table.num_reads
+
+
+@BOTH
+def test_a_tag_that_no_reader_can_report_is_refused(kind: str) -> None:
+    table = reads_table(0.1)
+    for epc in ("tag-a", "E28", "e280", ""):
+        with pytest.raises(RecordingError, match="upper-case hexadecimal"):
+            EMULATORS[kind](dataclasses.replace(table, epc=np.full(table.num_reads, epc)), ORIGIN_NS)
 
 
 async def _faulty(

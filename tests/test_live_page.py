@@ -76,8 +76,24 @@ def test_the_picture_shows_detected_tags_in_their_colours():
     for (y, x), shade in (((250, 240), (230, 159, 0)), ((200, 480), (86, 180, 233))):
         np.testing.assert_allclose(picture[y - 20 : y + 20, x - 20 : x + 20].mean((0, 1)), 0.65 * plain + 0.35 * np.array(shade), atol=4)  # fmt: skip
     np.testing.assert_allclose(picture[420:470, 20:120].mean((0, 1)), plain, atol=2)  # no mask
-    half = cv2.imdecode(np.frombuffer(overlay().jpeg(500), np.uint8), cv2.IMREAD_COLOR)
+    half = cv2.imdecode(np.frombuffer(overlay().jpeg(320), np.uint8), cv2.IMREAD_COLOR)
     assert half.shape == (480, 640, 3)  # half as large, and enlarged again for its letters
+
+
+def test_a_smaller_picture_has_masks_and_boxes_at_the_same_places():
+    scale = 500 / 640
+    whole, smaller = (
+        cv2.imdecode(np.frombuffer(overlay().jpeg(width), np.uint8), cv2.IMREAD_COLOR).astype(int)
+        for width in (640, 500)
+    )
+    assert smaller.shape == (375, 500, 3)
+    for picture, factor in ((whole, 1.0), (smaller, scale)):
+        orange = picture[..., 2] - picture[..., 0] > 40  # of the first tag: its tint, outline and box
+        columns = np.flatnonzero(orange[round(300 * factor)])
+        rows = np.flatnonzero(orange[:, round(200 * factor)])
+        # The edges of the box, 160 to 319 and 120 to 399, and of its line, two pixels wide.
+        np.testing.assert_allclose(columns[[0, -1]], [160 * factor, 319.5 * factor], atol=2.1)
+        np.testing.assert_allclose(rows[-1], 399.5 * factor, atol=2.1)
 
 
 def test_figures_that_are_not_finite_are_null(page):

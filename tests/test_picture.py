@@ -12,13 +12,12 @@ from PIL import Image, ImageSequence
 from test_segment_tracer import EPCS, scene
 
 from tagjax.core.settings import ConfigError
-from tagjax.evaluation import picture as module
 from tagjax.evaluation.picture import PictureConfig, make_picture, tag_curves
 from tagjax.evaluation.traced import Traced
 from tagjax.recording.store import save_recording
 from tagjax.report.animation import write_animation
 from tagjax.report.charts import GrowingCharts, TagCurves
-from tagjax.report.overlay import PALETTE_RGB
+from tagjax.report.overlay import PALETTE_RGB, scaled_boxes
 
 TRACER = {"_target_": "tagjax.tagattention.TagAttention", "segments": {"segmenter": {"num_segments": 256}}}
 CLIPS = {"stride": 1, "flow": "zero"}
@@ -110,8 +109,8 @@ def test_another_suffix_no_picture_and_wrong_settings_are_refused(tmp_path: Path
 
 def test_boxes_are_enlarged_about_the_edges_of_their_pixels() -> None:
     boxes = np.array([[0.0, 0.0, 9.0, 4.0], [3.0, 2.0, 3.0, 2.0]])  # ten by five pixels, and one pixel
-    np.testing.assert_allclose(module._scaled(boxes, 2.0), [[0, 0, 19, 9], [6, 4, 7, 5]])
-    np.testing.assert_allclose(module._scaled(boxes, 1.0), boxes)
+    np.testing.assert_allclose(scaled_boxes(boxes, 2.0), [[0, 0, 19, 9], [6, 4, 7, 5]])
+    np.testing.assert_allclose(scaled_boxes(boxes, 1.0), boxes)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError
 from ..metrics.recordings import box_to_picture, mask_to_picture
 from ..recording import Recording
-from ..report.overlay import draw_overlay, short_name, true_boxes
+from ..report.overlay import draw_overlay, scaled_boxes, short_name, true_boxes
 from ..tracing.status import status_or_detected
 from ..tracing.tracer import Trace
 from .traced import Traced, TracedConfig
@@ -154,16 +154,10 @@ def frame_overlay(
         colour.astype(np.uint8),
         [short_name(epc) for epc in traced.epcs],
         np.stack(masks) >= _MASK_LEVEL,
-        _scaled(box_to_picture(np.asarray(trace.box_px), stride, rows, columns), scale),
+        scaled_boxes(box_to_picture(np.asarray(trace.box_px), stride, rows, columns), scale),
         np.asarray(trace.confidence),
         detected,
         status=status_or_detected(trace.status, detected),
-        true_boxes_px=_scaled(true_boxes(recording, number, traced.epcs), scale),
+        true_boxes_px=scaled_boxes(true_boxes(recording, number, traced.epcs), scale),
         caption=caption,
     )
-
-
-def _scaled(boxes_px: Float64[np.ndarray, "tag 4"], scale: float) -> Float64[np.ndarray, "tag 4"]:
-    """Boxes (inclusive edges, pixel centres at integers) in a picture that is `scale` times as large."""
-    edges = np.array([-0.5, -0.5, 0.5, 0.5])
-    return (boxes_px + edges + 0.5) * scale - 0.5 - edges

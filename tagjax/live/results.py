@@ -42,18 +42,22 @@ class Totals:
     num_frames: int = 0
     num_dropped_reads: int = 0
     num_unused_reads: int = 0
+    preparing: Milliseconds = dataclasses.field(default_factory=Milliseconds)
     computing: Milliseconds = dataclasses.field(default_factory=Milliseconds)
     latency: Milliseconds = dataclasses.field(default_factory=Milliseconds)
     statuses: dict[str, int] = dataclasses.field(
         default_factory=lambda: {one.word: 0 for one in Status if one is not Status.UNKNOWN}
     )
 
-    def add(self, found: LiveFrame, tags: dict[str, Sighting], computing_s: float, latency_s: float) -> None:
-        """Count a frame: the time that it took, and that from its moment to its result."""
+    def add(
+        self, found: LiveFrame, tags: dict[str, Sighting], *, prepared_s: float, followed_s: float, latency_s: float
+    ) -> None:
+        """Count a frame: the time that its flow and the tracer's step took, and that from its moment to its result."""
         self.num_frames += 1
         self.num_dropped_reads += found.num_dropped
         self.num_unused_reads += found.num_unused
-        self.computing.add(computing_s)
+        self.preparing.add(prepared_s)
+        self.computing.add(prepared_s + followed_s)
         self.latency.add(latency_s)
         for tag in tags.values():
             self.statuses[tag.status] = self.statuses.get(tag.status, 0) + 1
@@ -65,6 +69,7 @@ class Totals:
             "dropped_reads": self.num_dropped_reads,
             "unused_reads": self.num_unused_reads,
             "status": self.statuses,  # frames of all tags, by status
-            "process_ms": self.computing.summary(),
+            "process_ms": self.computing.summary(),  # flow, and then the tracer's step; two frames are worked on at once
+            "flow_ms": self.preparing.summary(),
             "latency_ms": self.latency.summary(),
         }

@@ -40,7 +40,8 @@ class SensorStream:
     """An iterator over `SensorFrame`. It ends where the camera has no more frames.
 
     `open` starts the camera, and `start` the reader; frames count from then on. `close` ends all, and finishes the recording
-    at `record`, which must not exist. Raises `CameraError`, `ReaderError` or `RecordingError` as they occur.
+    at `record`, which must not exist. `next_pictures` and `with_reads` are the two halves of a step: what works on the pictures
+    meanwhile need not wait for the reads. Raises `CameraError`, `ReaderError` or `RecordingError` as they occur.
     """
 
     def __init__(self, config: SensorConfig, *, record: str | None = None, reads_wait_s: float = 0.02):
@@ -110,24 +111,34 @@ class SensorStream:
         return self
 
     def __next__(self) -> SensorFrame:
+        frame = self.next_pictures()
+        if frame is None:
+            raise StopIteration
+        return self.with_reads(frame)
+
+    def next_pictures(self) -> SensorFrame | None:
+        """The newest frame, still without reads; None where no more come."""
         with self._changed:
-            while not self._frames:
+            while not self._frames and self._error is None and not self._over():
                 self._changed.wait(_POLL_S)
-                if self._error is not None:
-                    raise self._error
-                if not self._frames and (self._closed.is_set() or self._filming is None or self._filming.ended):
-                    if self._filming is not None and self._filming.error is not None:
-                        raise self._filming.error
-                    raise StopIteration
+            if self._error is not None:
+                raise self._error
+            if not self._frames:
+                if self._filming is not None and self._filming.error is not None:
+                    raise self._filming.error
+                return None
             time_ns, frame = self._frames.popleft()
-        left_s = self._wait_s - 1e-9 * (HOST_CLOCK.now_ns() - frame.arrival_time_ns)
-        if left_s > 0:
-            self._closed.wait(left_s)
         time_ns = max(time_ns, self._taken_ns + 1)
-        reads = self._reads_until(time_ns)
         self._taken_ns, self._number = time_ns, self._number + 1
         due_s = time.monotonic() - 1e-9 * (HOST_CLOCK.now_ns() - frame.arrival_time_ns)
-        return SensorFrame(self._number - 1, time_ns, due_s, frame.colour, _metres(frame.depth), reads)
+        return SensorFrame(self._number - 1, time_ns, due_s, frame.colour, _metres(frame.depth), TagReads.empty())
+
+    def with_reads(self, frame: SensorFrame) -> SensorFrame:
+        """The frame with the reads made until then, once those that were under way had their time to come."""
+        left_s = frame.due_s + self._wait_s - time.monotonic()
+        if left_s > 0:
+            self._closed.wait(left_s)
+        return dataclasses.replace(frame, reads=self._reads_until(frame.time_ns))
 
     @property
     def num_waiting_reads(self) -> int:
@@ -175,6 +186,10 @@ class SensorStream:
             finished = finish_recording(self._record)
             kept |= {"frames": finished.num_frames, "reads": finished.num_reads}
         return {**found, "record": kept}
+
+    def _over(self) -> bool:
+        """Whether no more frames come."""
+        return self._closed.is_set() or self._filming is None or self._filming.ended
 
     def _take_frame(self, frame: CameraFrame) -> None:
         device_ns = frame.arrival_time_ns if frame.device_time_ns is None else frame.device_time_ns
@@ -224,5 +239,7 @@ class SensorStream:
 
 def _metres(depth: np.ndarray) -> np.ndarray:
     """Depth in metres, 0 = missing, of millimetres as uint16 or metres as float32."""
-    metres = depth.astype(np.float32) * np.float32(1e-3 if depth.dtype.kind in "ui" else 1.0)
+    if depth.dtype.kind == "u":
+        return depth * np.float32(1e-3)
+    metres = depth.astype(np.float32)
     return np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))

@@ -20,8 +20,10 @@ from ..core.results import to_json_values, write_json
 from ..core.settings import ConfigError
 from ..flow.registry import make_flow
 from ..tagattention.tracer_settings import make_tracer, tracer_clips
-from ..tracing.live import LiveMethod, LiveTracer
-from ..tracing.replay import Replay, SensorFrame
+from ..tracing.live import LiveTracer
+from ..tracing.live_step import LiveMethod
+from ..tracing.replay import Replay
+from .ahead import FramesAhead, PreparedFrame
 from .config import Source, StreamConfig, open_source
 from .event_log import EventLog
 from .feed import Feed
@@ -57,22 +59,29 @@ def run_stream(
         own = tracer_clips(config.tracer).stride if config.stride is None else config.stride
         stride = working_stride(source.intrinsics.width, own)
         live = _live_tracer(config, tracer, source, stride)
+        page = _page(config, stack, source.name, on_page)
         on_progress(_STAGE, 0, source.num_frames, "compiling")
         start_s = live.warm_up()
         lines = stack.enter_context((folder / "frames.jsonl").open("w"))
         events = EventLog(config.events, stack.enter_context((folder / "events.jsonl").open("w")))
         stack.callback(events.close)
-        frames, begun = source.start(), time.monotonic()
-        feed = _feed(config, stack, source.name, live, stride, frames, events, on_page)
+        frames, begun, used_s = source.start(), time.monotonic(), time.process_time()
+        feed = None if page is None else _feed(config, page, live, stride, frames, events)
         shape = source.intrinsics.height, source.intrinsics.width
         following = _Following(live, stride, shape, totals, lines, events, feed)
-        interrupted = _followed(following, frames, source.num_frames, on_progress)
-        lasted_s = time.monotonic() - begun
+        ahead = stack.enter_context(contextlib.closing(FramesAhead(frames, live)))
+
+        def traced(text: str) -> None:
+            on_progress(_STAGE, totals.num_frames + frames.num_dropped, source.num_frames, text)
+
+        interrupted = _followed(following, ahead, traced)
+        lasted_s, used_s = time.monotonic() - begun, time.process_time() - used_s
     summary = {
         **totals.summary(),
         "dropped_frames": frames.num_dropped,
         "camera_moved": live.camera_moved,
         "frames_per_s": round(totals.num_frames / max(lasted_s, 1e-9), 2),
+        "cpu_ms": round(1e3 * used_s / max(totals.num_frames, 1), 2),  # of all threads of the process, a frame
         "start_s": round(start_s, 2),
         "events": events.summary(),
         **({} if isinstance(frames, Replay) else {"sensors": frames.summary()}),
@@ -96,22 +105,27 @@ def _live_tracer(config: StreamConfig, tracer: LiveMethod, source: Source, strid
     )
 
 
-def _feed(
-    config: StreamConfig,
-    stack: contextlib.ExitStack,
-    name: str,
-    live: LiveTracer,
-    stride: int,
-    frames: Replay | SensorStream,
-    events: EventLog,
-    on_page: Callable[[str], None] | None,
-) -> Feed | None:
+def _page(
+    config: StreamConfig, stack: contextlib.ExitStack, name: str, on_page: Callable[[str], None] | None
+) -> LivePage | None:
     """The web page, served until the stack unwinds; None without one."""
     if config.page.port is None:
         return None
     page = stack.enter_context(contextlib.closing(LivePage(config.page, f"tagjax: {name}")))
     if on_page is not None:
         on_page(page.address)
+    return page
+
+
+def _feed(
+    config: StreamConfig,
+    page: LivePage,
+    live: LiveTracer,
+    stride: int,
+    frames: Replay | SensorStream,
+    events: EventLog,
+) -> Feed:
+    """What the page gets of each frame."""
 
     def notes() -> list[str]:
         moved = ["the camera has moved, which misleads the tracer"] if live.camera_moved else []
@@ -132,14 +146,16 @@ class _Following:
     events: EventLog
     feed: Feed | None
 
-    def __call__(self, frame: SensorFrame) -> str:
+    def __call__(self, prepared: PreparedFrame) -> str:
         """Trace a frame and hand its result on; a line for people."""
-        taken = time.monotonic()
-        found = self.live.process(frame.colour, frame.depth_m, frame.time_ns, frame.reads)
+        frame, taken = prepared.frame, time.monotonic()
+        found = self.live.follow(prepared.pictures, frame.time_ns, frame.reads)
         jax.block_until_ready(found.trace)
         done = time.monotonic()
         tags = sightings(found, self.stride, self.shape)
-        self.totals.add(found, tags, done - taken, done - frame.due_s)
+        self.totals.add(
+            found, tags, prepared_s=prepared.prepared_s, followed_s=done - taken, latency_s=done - frame.due_s
+        )
         line = {"time_ns": found.time_ns, "tags": {epc: dataclasses.asdict(tag) for epc, tag in tags.items()}}
         self.lines.write(json.dumps(line) + "\n")
         events = self.events.add(found.time_ns, tags)
@@ -149,12 +165,11 @@ class _Following:
         return f"{self.totals.computing.percentile(50):.0f} ms; {states}"
 
 
-def _followed(following: _Following, frames: Replay | SensorStream, num_frames: int, on_progress: OnProgress) -> bool:
+def _followed(following: _Following, frames: FramesAhead, on_frame: Callable[[str], None]) -> bool:
     """Follow all frames; whether Ctrl-C ended it."""
     try:
         for frame in frames:
-            text = following(frame)
-            on_progress(_STAGE, following.totals.num_frames + frames.num_dropped, num_frames, text)
+            on_frame(following(frame))
     except KeyboardInterrupt:
         return True
     return False

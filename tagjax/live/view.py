@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from ..core.results import to_json_values
-from ..report.overlay import draw_overlay, short_name
+from ..report.overlay import draw_overlay, scaled_boxes, short_name
 from ..tracing.status import Status
 from .events import Event, Sighting
 
@@ -45,33 +45,37 @@ class Overlay:
     tags: Mapping[str, Sighting]
 
     def jpeg(self, width: int) -> bytes:
-        """The overlay, at most about `width` pixels wide."""
-        step = max(1, -(-self.colour.shape[1] // width))
-        colour = np.ascontiguousarray(self.colour[::step, ::step])
-        masks = np.zeros((len(self.tags), *colour.shape[:2]), bool)
-        boxes = np.full((len(self.tags), 4), np.nan)
+        """The overlay, at most `width` pixels wide."""
+        rows, columns = self.colour.shape[:2]
+        scale = min(1.0, width / columns)
+        size = (round(columns * scale), round(rows * scale))
+        colour = self.colour if scale == 1 else cv2.resize(self.colour, size, interpolation=cv2.INTER_AREA)
+        masks, boxes = np.zeros((len(self.tags), *colour.shape[:2]), bool), np.full((len(self.tags), 4), np.nan)
         for place, tag in enumerate(self.tags.values()):
             if tag.detected and tag.box_px is not None:
-                masks[place] = self._mask(place, step, colour.shape[:2])
-                boxes[place] = np.asarray(tag.box_px) / step
+                masks[place] = self._mask(place, scale, size)
+                boxes[place] = tag.box_px
         picture = draw_overlay(
             colour,
             [short_name(epc) for epc in self.tags],
             masks,
-            boxes,
+            scaled_boxes(boxes, scale),
             np.array([tag.confidence for tag in self.tags.values()], np.float64),
             np.array([tag.detected for tag in self.tags.values()], bool),
         )
-        coded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+        coded = cv2.imencode(
+            ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        )[1]
         return coded.tobytes()
 
-    def _mask(self, place: int, step: int, shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    def _mask(self, place: int, scale: float, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+        """A tag's mask in the picture of this scale and (width, height)."""
         member = self.membership[place] > 0.5
         member[0] = False
         small = (member[np.maximum(self.labels, 0)] & (self.labels > 0)).astype(np.float32)
-        scale = self.stride / step
-        matrix = np.array([[scale, 0, 0], [0, scale, 0]], np.float64)
-        size = (shape[1], shape[0])
+        # Working pixel i is pixel i * stride of the whole picture.
+        shift = 0.5 * scale - 0.5
+        matrix = np.array([[self.stride * scale, 0, shift], [0, self.stride * scale, shift]], np.float64)
         return cv2.warpAffine(small, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) > 0.5
 
 
@@ -95,8 +99,8 @@ class View:
 
 
 def tag_rows(tags: Mapping[str, Sighting], rates_hz: Mapping[str, float]) -> list[dict[str, Any]]:
-    """A row a tag: EPC, colour, status with its reason, confidence, distance to the camera, reads per second."""
-    return [
+    """A row a tag, in the order of EPCs: colour, status with its reason, confidence, distance to the camera, reads per second."""
+    rows = [
         {
             "epc": epc,
             "colour": number % 8,
@@ -109,6 +113,7 @@ def tag_rows(tags: Mapping[str, Sighting], rates_hz: Mapping[str, float]) -> lis
         }
         for number, (epc, tag) in enumerate(tags.items())
     ]
+    return sorted(rows, key=lambda row: row["epc"])
 
 
 def event_rows(events: Sequence[Event], first_ns: int) -> list[dict[str, Any]]:

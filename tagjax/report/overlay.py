@@ -56,9 +56,9 @@ def draw_overlay(
     Tags that are not detected, and of which `status` gives the reason, are listed from the upper left corner down.
     """
     scale = -(-MIN_WIDTH // colour.shape[1])
-    picture = np.ascontiguousarray(colour.repeat(scale, axis=0).repeat(scale, axis=1))
-    boxes_px = boxes_px * scale
-    true_boxes_px = None if true_boxes_px is None else true_boxes_px * scale
+    picture = _enlarged(colour, scale)
+    boxes_px = scaled_boxes(boxes_px, float(scale))
+    true_boxes_px = None if true_boxes_px is None else scaled_boxes(true_boxes_px, float(scale))
     labels: list[tuple[str, tuple[int, int, int, int], tuple[int, int, int]]] = []
     for tag, name in enumerate(names):
         shade = PALETTE_RGB[tag % len(PALETTE_RGB)]
@@ -67,11 +67,7 @@ def draw_overlay(
             cv2.rectangle(picture, (x0, y0), (x1, y1), (255, 255, 255), 1)
         if not detected[tag] or not np.all(np.isfinite(boxes_px[tag])):
             continue
-        mask = masks[tag].repeat(scale, axis=0).repeat(scale, axis=1)
-        tinted = 0.65 * picture[mask].astype(np.float32) + 0.35 * np.array(shade, np.float32)
-        picture[mask] = tinted.astype(np.uint8)
-        outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, outline, -1, shade, 1)
+        _tint(picture, _enlarged(masks[tag].astype(np.uint8), scale), shade)
         x0, y0, x1, y1 = np.round(boxes_px[tag]).astype(int).tolist()
         cv2.rectangle(picture, (x0, y0), (x1, y1), shade, 2)
         labels.append((f"{name} {confidence[tag]:.2f}", (x0, y0, x1, y1), shade))
@@ -89,6 +85,28 @@ def draw_overlay(
         _text(picture, text, place, shade)
         taken.append(_extent(text, place))
     return picture
+
+
+def scaled_boxes(boxes_px: Shaped[np.ndarray, "tag 4"], scale: float) -> Float[np.ndarray, "tag 4"]:
+    """Boxes (inclusive edges, pixel centres at integers) in a picture that is resized to `scale` times its size."""
+    edges = np.array([-0.5, -0.5, 0.5, 0.5])
+    return (boxes_px + edges + 0.5) * scale - 0.5 - edges
+
+
+def _enlarged(picture: np.ndarray, scale: int) -> np.ndarray:
+    """A copy in which each pixel is `scale` x `scale` large."""
+    return np.ascontiguousarray(picture.repeat(scale, axis=0).repeat(scale, axis=1)) if scale > 1 else picture.copy()
+
+
+def _tint(picture: np.ndarray, mask: UInt8[np.ndarray, "height width"], shade: tuple[int, int, int]) -> None:
+    """Tint the mask and draw its outline, within the rectangle that it fills."""
+    left, top, width, height = cv2.boundingRect(mask)
+    part, own = picture[top : top + height, left : left + width], mask[top : top + height, left : left + width]
+    if part.size:
+        levels = 0.65 * np.arange(256, dtype=np.float32)[:, None] + 0.35 * np.array(shade, np.float32)
+        np.copyto(part, cv2.LUT(part, levels.astype(np.uint8)[None]), where=own[..., None] > 0)
+        outline, _ = cv2.findContours(own, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(left, top))
+        cv2.drawContours(picture, outline, -1, shade, 1)
 
 
 def picture_overlay(recording: Recording, picture: Picture) -> UInt8[np.ndarray, "picture_height picture_width 3"]:

@@ -9,15 +9,12 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Hashable
-from functools import partial
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
 
 from ..core.camera import Intrinsics, working_stride
 from ..core.geometry import pixel_rays, range_to_depth
@@ -25,29 +22,15 @@ from ..radio.arrivals import Arrivals
 from ..recording import RecordingWarning, TagReads
 from .arrivals import frame_arrivals
 from .clips import MAX_ARRIVALS, subsampled_depth
+from .live_step import Fixed, LiveMethod, Sensed, first_state, shifted, step, with_tags
 from .recordings import CAMERA_MOVED
-from .tracer import Camera, Frame
+from .tracer import Camera
 
 MAX_TAGS = 256
 """Places for tags. Beyond, new tags wait until another one has not been read for some time."""
 
 _NUM_PLACES = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 _REBASE_S = 1024.0  # times on the device are float32 seconds from an origin, which is moved so often
-
-
-@runtime_checkable
-class LiveMethod(Protocol):
-    """What a tracer must have to run live."""
-
-    def init(self, camera: Camera, frame: Frame) -> Any: ...
-
-    def follow(self, camera: Camera, state: Any, frame: Frame) -> tuple[Any, Any]: ...
-
-    def with_tags(self, camera: Camera, state: Any, source: Int[Array, " tag"]) -> Any: ...
-
-    def shifted(self, state: Any, by_s: Array) -> Any: ...
-
-    def camera_moved(self, state: Any) -> Array | None: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +44,19 @@ class LiveFrame:
     num_unused: int  # others: of another antenna or an unknown carrier, not between the last frame and this one, or of a tag without a place
 
 
+@dataclasses.dataclass(frozen=True)
+class Pictures:
+    """What the pictures of a frame bring, at the working resolution, on the host: all that can be had before its reads."""
+
+    depth_m: np.ndarray  # (rows, columns), 0 = missing
+    backward_px: np.ndarray  # (rows, columns, 2) flow to the picture prepared before it, pixels of this resolution
+
+
 class LiveTracer:
     """Holds a tracer's state between frames. `process` takes the next frame; frames come in order of time.
+
+    `process` is `prepare` and then `follow`. One thread may prepare a frame while another follows the one before: flow takes
+    about as long as the tracer's step. Each frame that is prepared must then be followed, in the same order.
 
     `flow` gives the flow from the first picture to the second, (height, width, 2) pixels; `stride` keeps every n-th pixel, None about 256 columns;
     `antennas` are the numbers (from 1) of those at `antennas_m`, of which reads are used. A tag that has not been read for
@@ -102,7 +96,7 @@ class LiveTracer:
         self._camera = Camera(
             rays=jnp.asarray(pixel_rays(intrinsics.scaled(stride))), antennas_m=jnp.asarray(chosen, jnp.float32)
         )
-        self._fixed = _Fixed.of(tracer, self._camera)
+        self._fixed = Fixed.of(tracer, self._camera)
         self._places: list[str | None] = [None] * num_places
         self._last_read_ns: dict[str, int] = {}
         self._state: Any = None
@@ -119,42 +113,53 @@ class LiveTracer:
         missing. Raises `ValueError` for a frame that is not later than the last, and for pictures of another size; the frame
         is then left out, and the next may follow.
         """
-        first = self._state is None
-        if not first and time_ns <= self._time_ns:
-            raise ValueError(f"Found a frame at {time_ns} ns after one at {self._time_ns} ns; expected a later time.")
+        self._check_time(time_ns)
+        return self.follow(self.prepare(colour, depth_m), time_ns, reads)
+
+    def prepare(self, colour: np.ndarray, depth_m: np.ndarray) -> Pictures:
+        """Flow since the last frame that was prepared, and depth, of the next frame. Raises `ValueError` for pictures of another size."""
         height, width = self._intrinsics.height, self._intrinsics.width
         if colour.shape[:2] != (height, width) or depth_m.shape != (height, width):
             raise ValueError(
                 f"Found colour {colour.shape} and depth {depth_m.shape}; expected {height} x {width} as the intrinsics say."
             )
-        if first:
-            self._begun_ns = self._origin_ns = self._time_ns = time_ns
         depth_m = range_to_depth(depth_m[None], self._intrinsics)[0] if self._range else depth_m
         depth_m = subsampled_depth(depth_m[None], self._stride)[0]
-        if self._colour is None:
-            backward_px = np.zeros((*depth_m.shape, 2), np.float32)
-        else:
-            every = self._stride
-            backward_px = np.asarray(self._flow(colour, self._colour))[::every, ::every] / np.float32(every)
+        before, self._colour = self._colour, colour
+        if before is None:
+            return Pictures(depth_m, np.zeros((*depth_m.shape, 2), np.float32))
+        every = self._stride
+        return Pictures(depth_m, np.asarray(self._flow(colour, before))[::every, ::every] / np.float32(every))
+
+    def follow(self, pictures: Pictures, time_ns: int, reads: TagReads) -> LiveFrame:
+        """Trace a prepared frame with the reads since the last one; as `process`. Raises `ValueError` for a time that is not later."""
+        self._check_time(time_ns)
+        first = self._state is None
+        if first:
+            self._begun_ns = self._origin_ns = self._time_ns = time_ns
         self._admit(reads, time_ns)
         epcs = [epc if epc is not None else f"\0{place}" for place, epc in enumerate(self._places)]
         arrivals, unused = frame_arrivals(
             reads, epcs, self._antennas, np.array([time_ns]), self._origin_ns, self._num_reads,
             since_ns=self._time_ns if not first else None,
         )  # fmt: skip
-        sensed = self._sensed((time_ns - self._origin_ns) * 1e-9, depth_m, backward_px, arrivals)
+        sensed = self._sensed((time_ns - self._origin_ns) * 1e-9, pictures, arrivals)
         if first:
-            self._state = _init(self._fixed.others, self._fixed.arrays, sensed)
+            self._state = first_state(self._fixed.others, self._fixed.arrays, sensed)
         self._warn_of_motion()
-        self._state, trace, self._moved = _follow(self._fixed.others, self._fixed.arrays, sensed, self._state)
-        self._colour, self._time_ns = colour, time_ns
+        self._state, trace, self._moved = step(self._fixed.others, self._fixed.arrays, sensed, self._state)
+        self._time_ns = time_ns
         if (later_s := (time_ns - self._origin_ns) * 1e-9 // _REBASE_S * _REBASE_S) > 0:
-            self._state = _shifted(self._tracer, self._state, jnp.asarray(-later_s, jnp.float32))
+            self._state = shifted(self._tracer, self._state, jnp.asarray(-later_s, jnp.float32))
             self._origin_ns += int(later_s * 1e9)
         places = {epc: place for place, epc in enumerate(self._places) if epc is not None}
         num_dropped = int(unused.num_dropped.sum())
         num_unused = reads.num_reads - num_dropped - int(np.sum(arrivals.valid))
         return LiveFrame(time_ns, places, trace, num_dropped, num_unused)
+
+    def _check_time(self, time_ns: int) -> None:
+        if self._state is not None and time_ns <= self._time_ns:
+            raise ValueError(f"Found a frame at {time_ns} ns after one at {self._time_ns} ns; expected a later time.")
 
     def _warn_of_motion(self) -> None:
         """Warn where the camera has moved before this frame: what the last one says is on the host by now."""
@@ -165,24 +170,29 @@ class LiveTracer:
         warnings.warn(CAMERA_MOVED.format(f"{at_s:.1f} s after the first frame"), RecordingWarning, stacklevel=3)
 
     def warm_up(self) -> float:
-        """Compile the tracer's step on a blank frame, before the first frame comes; the seconds that it took."""
+        """Compile all that a frame needs on blank ones, before the first frame comes; the seconds that it took."""
         begun = time.perf_counter()
         height, width, _ = self._camera.rays.shape
         arrivals, _ = frame_arrivals(
             TagReads.empty(), [f"\0{place}" for place in range(len(self._places))], self._antennas, np.array([0]), 0,
             self._num_reads,
         )  # fmt: skip
-        no_depth = np.zeros((height, width), np.float32)
-        sensed = self._sensed(0.0, no_depth, np.zeros((height, width, 2), np.float32), arrivals)
-        state = _init(self._fixed.others, self._fixed.arrays, sensed)
-        jax.block_until_ready(_follow(self._fixed.others, self._fixed.arrays, sensed, state))
+        blank = np.zeros((self._intrinsics.height, self._intrinsics.width, 3), np.uint8)
+        self._flow(blank, blank)
+        nothing = Pictures(np.zeros((height, width), np.float32), np.zeros((height, width, 2), np.float32))
+        sensed = self._sensed(0.0, nothing, arrivals)
+        state = first_state(self._fixed.others, self._fixed.arrays, sensed)
+        state, _, _ = step(self._fixed.others, self._fixed.arrays, sensed, state)
+        places = jnp.arange(len(self._places), dtype=jnp.int32)
+        jax.block_until_ready(with_tags(self._tracer, self._camera, state, places))
+        jax.block_until_ready(shifted(self._tracer, state, jnp.zeros((), jnp.float32)))
         return time.perf_counter() - begun
 
-    def _sensed(self, time_s: float, depth_m: np.ndarray, backward_px: np.ndarray, arrivals: Arrivals) -> _Sensed:
-        return _Sensed(
+    def _sensed(self, time_s: float, pictures: Pictures, arrivals: Arrivals) -> Sensed:
+        return Sensed(
             time_s=np.float32(time_s),
-            depth_m=np.asarray(depth_m, np.float32),
-            backward_px=np.asarray(backward_px, np.float32),
+            depth_m=np.asarray(pictures.depth_m, np.float32),
+            backward_px=np.asarray(pictures.backward_px, np.float32),
             arrivals=jax.tree.map(lambda leaf: leaf[0], arrivals),
             present=np.array([epc is not None for epc in self._places]),
         )
@@ -212,7 +222,7 @@ class LiveTracer:
             return
         if self._state is not None:
             source = [self._places.index(one) if one in known and one is not None else -1 for one in places]
-            self._state = _with_tags(self._tracer, self._camera, self._state, jnp.asarray(source, jnp.int32))
+            self._state = with_tags(self._tracer, self._camera, self._state, jnp.asarray(source, jnp.int32))
         self._places = places
 
     def _warn_of_tags(self) -> None:
@@ -224,61 +234,3 @@ class LiveTracer:
                 RecordingWarning,
                 stacklevel=4,
             )
-
-
-class _Sensed(NamedTuple):
-    """What a frame brings, on the host: the rest of a `Frame` is made on the device."""
-
-    time_s: Any
-    depth_m: Any
-    backward_px: Any
-    arrivals: Arrivals
-    present: Any
-
-    def frame(self, num_antennas: int) -> Frame:
-        """The tracer's input."""
-        return Frame.of_arrivals(self.time_s, self.depth_m, self.backward_px, self.arrivals, self.present, num_antennas)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Fixed:
-    """Tracer and camera, taken apart once: to do so for every frame takes as long as its depth."""
-
-    arrays: list[Array | None]
-    others: Hashable  # a part of the compiled program
-
-    @staticmethod
-    def of(tracer: LiveMethod, camera: Camera) -> _Fixed:
-        leaves, structure = jax.tree.flatten((tracer, camera))
-        arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
-        return _Fixed(arrays, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)))
-
-
-def _joined(others: Any, arrays: list[Array | None]) -> tuple[LiveMethod, Camera]:
-    structure, leaves = others
-    pairs = zip(arrays, leaves, strict=True)
-    return jax.tree.unflatten(structure, [leaf if array is None else array for array, leaf in pairs])
-
-
-@partial(jax.jit, static_argnums=0)
-def _init(others: Hashable, arrays: list[Array | None], sensed: _Sensed) -> Any:
-    tracer, camera = _joined(others, arrays)
-    return tracer.init(camera, sensed.frame(camera.antennas_m.shape[0]))
-
-
-@partial(jax.jit, static_argnums=0, donate_argnums=3)
-def _follow(others: Hashable, arrays: list[Array | None], sensed: _Sensed, state: Any) -> tuple[Any, Any, Any]:
-    """The next state, the output, and whether the camera has moved."""
-    tracer, camera = _joined(others, arrays)
-    state, trace = tracer.follow(camera, state, sensed.frame(camera.antennas_m.shape[0]))
-    return state, trace, tracer.camera_moved(state)
-
-
-@eqx.filter_jit
-def _with_tags(tracer: LiveMethod, camera: Camera, state: Any, source: Int[Array, " tag"]) -> Any:
-    return tracer.with_tags(camera, state, source)
-
-
-@eqx.filter_jit
-def _shifted(tracer: LiveMethod, state: Any, by_s: Array) -> Any:
-    return tracer.shifted(state, by_s)

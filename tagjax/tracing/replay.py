@@ -46,7 +46,10 @@ class SensorFrame:
 
 
 class Replay:
-    """An iterator over `SensorFrame`; `close` ends it early. `num_dropped` counts frames that were not taken in time."""
+    """An iterator over `SensorFrame`; `close` ends it early. `num_dropped` counts frames that were not taken in time.
+
+    `next_pictures` and `with_reads` are its two halves, for one that has work to do on the pictures before the reads.
+    """
 
     def __init__(self, recording: Recording, settings: ReplaySettings | None = None):
         self._recording, self._settings = recording, settings or ReplaySettings()
@@ -61,15 +64,22 @@ class Replay:
         return self
 
     def __next__(self) -> SensorFrame:
+        frame = self.next_pictures()
+        if frame is None:
+            raise StopIteration
+        return self.with_reads(frame)
+
+    def next_pictures(self) -> SensorFrame | None:
+        """The next frame, still without reads; None after the last."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._ended)
             if self._waiting:
                 frame = self._waiting.popleft()
                 self._changed.notify_all()
-                return self._with_reads(frame)
+                return frame
             if self._error is not None:
                 raise self._error
-            raise StopIteration
+            return None
 
     def close(self) -> None:
         """End the replay; frames that wait are dropped."""
@@ -108,8 +118,8 @@ class Replay:
         times = self._recording.time_ns
         return int(times[-1] - times[0]) + (int(np.median(np.diff(times))) if len(times) > 1 else 33_333_333)
 
-    def _with_reads(self, frame: SensorFrame) -> SensorFrame:
-        """The frame with the reads since the one taken before, of this loop."""
+    def with_reads(self, frame: SensorFrame) -> SensorFrame:
+        """The frame with the reads since the one before it for which this was called, of this loop."""
         reads = self._recording.reads
         shift_ns = frame.time_ns - int(self._recording.time_ns[frame.number])
         first, last = np.searchsorted(reads.time_ns + shift_ns, [self._taken_ns, frame.time_ns], side="right")

@@ -103,7 +103,10 @@ async function draw(bytes) {
 
 async function next() {
   const answer = await fetch(`frame?stream=${stream}&after=${after}`, { cache: "no-store", signal: AbortSignal.timeout(20000) });
-  if (answer.status === 204) return state("no new frame", "wrong");
+  if (answer.status === 204) {
+    const starting = answer.headers.get("Tagjax-State") === "starting";
+    return starting ? state("starting: the tracer is compiled first", "starting") : state("no new frame", "wrong");
+  }
   if (answer.status === 410) throw new Error("ended");
   if (!answer.ok) throw new Error(`answer ${answer.status}`);
   const bytes = await answer.arrayBuffer();

@@ -75,6 +75,11 @@ class LivePage:
         now = time.monotonic()
         return now - self._asked_s < _WATCHED_S and now - self._shown_s >= self._interval_s
 
+    @property
+    def begun(self) -> bool:
+        """Whether there has been a frame."""
+        return self._view is not None
+
     def show(self, view: View) -> None:
         """Take the newest frame; the last one is forgotten."""
         with self._changed:
@@ -175,6 +180,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if status != HTTPStatus.NO_CONTENT:
             self.send_header("Content-Length", str(len(body)))
         self.send_header("Tagjax-Stream", self.server.page.stream)
+        if not self.server.page.begun:
+            self.send_header("Tagjax-State", "starting")
         self.send_header("Cache-Control", "no-store")
         self.send_header("Content-Security-Policy", content_security_policy())
         self.send_header("Cross-Origin-Resource-Policy", "same-origin")

@@ -82,6 +82,16 @@ class EmulatedReads:
         return (start_ns + since_ns + drift_ns + round(self.settings.clock_offset_s * 1e9)) // 1000 * 1000
 
 
+def _check_epcs(reads: TagReads) -> None:
+    """Raise `RecordingError` for a tag that no reader can report: its EPC is sent as bytes."""
+    for epc in reads.epcs:
+        if len(epc) % 4 or not epc or set(epc) - set("0123456789ABCDEF"):
+            raise RecordingError(
+                f"The recording has the tag {epc!r}, which no reader can report; expected an EPC of upper-case hexadecimal digits "
+                "in words of four. Choose reader=playback, or another recording."
+            )
+
+
 def _channels(reads: TagReads, hop_table_hz: tuple[float, ...]) -> np.ndarray:
     if reads.channel_index is not None:
         return reads.channel_index.astype(np.int64)
@@ -121,6 +131,7 @@ class AbstractEmulator(abc.ABC):
         settings: EmulatorSettings | None = None,
         port: int = 0,
     ):
+        _check_epcs(reads)
         self.table = EmulatedReads(reads, origin_ns, settings or EmulatorSettings())
         self.start = start or PlaybackStart()
         self.port = port  # 0: any; the true one once it listens
@@ -197,11 +208,17 @@ class AbstractEmulator(abc.ABC):
         return self._next >= len(self.table.leaves_ns)
 
     async def _read(self) -> None:
-        """Send each row when it leaves the network. Rows whose time has passed before the inventory began were never read."""
+        """Send each row when it leaves the network.
+
+        Rows whose time had passed when the inventory began were never read. One that waits for the playback's begin has read
+        them all: on a busy machine it may notice the begin late.
+        """
+        waited = self.start.time_ns is None
         while self.start.time_ns is None:
             await asyncio.sleep(0.002)
         leaves = self.table.leaves_ns + self.start.time_ns
-        self._next = max(self._next, int(np.searchsorted(leaves, HOST_CLOCK.now_ns())))
+        if not waited:
+            self._next = max(self._next, int(np.searchsorted(leaves, HOST_CLOCK.now_ns())))
         while self._next < len(leaves):
             now = HOST_CLOCK.now_ns()
             due = int(np.searchsorted(leaves, now, side="right"))

@@ -129,14 +129,16 @@ class LlrpEmulator(AbstractEmulator):
             await self._end(writer)
 
     async def _end(self, writer: asyncio.StreamWriter) -> None:
-        await self.stop_inventory()
-        if self._keepalive is not None:
-            self._keepalive.cancel()
-        self._keepalive = None
-        writer.close()
-        with contextlib.suppress(ConnectionError):
-            await writer.wait_closed()
-        self._writer = None
+        try:
+            await self.stop_inventory()
+            if self._keepalive is not None:
+                self._keepalive.cancel()
+            self._keepalive = None
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+        finally:
+            self._writer = None  # `close` waits for this
 
     async def _answer(self, message: Any) -> None:
         from llrpkit.protocol import enums, impinj, messages, params

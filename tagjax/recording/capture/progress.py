@@ -45,6 +45,13 @@ class Progress:
             self._rssi_dbm.append(read.rssi_dbm)
             self._drift.add(read.reader_time_ns, read.arrival_time_ns)
 
+    @property
+    def num_taken(self) -> int:
+        """Reads of the reader so far, with those that were dropped, reported twice, or not usable."""
+        with self._lock:
+            others = self.events["malformed"] + self.events["duplicate"] + self.events["overflow"]
+            return self.num_reads + self.num_dropped_reads + others
+
     def event(self, event: ReaderEvent) -> None:
         """Count an event."""
         with self._lock:

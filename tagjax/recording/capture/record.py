@@ -25,6 +25,7 @@ from .writing_thread import FilmingThread, Sink, Threads, WritingThread
 _STATUS_S = 1.0
 _POLL_S = 0.05
 _LAST_READS_S = 0.25  # after the last frame, for reads that are under way
+_QUIET_S = 5.0  # without a read, those of a played recording that are still missing are given up
 
 
 def record(
@@ -139,18 +140,24 @@ async def _until_the_end(
         if config.duration_s is not None and begun is not None and now - begun >= config.duration_s:
             return
         if threads.filming.ended:
-            await _last_reads(config, sensors)
+            await _last_reads(config, sensors, progress)
             return
 
 
-async def _last_reads(config: RecordConfig, sensors: Sensors) -> None:
-    """Wait for reads that were made before the last frame, and are still under way."""
-    until = time.monotonic() + _LAST_READS_S + config.emulator.jitter_s
+async def _last_reads(config: RecordConfig, sensors: Sensors, progress: Progress) -> None:
+    """Wait for reads that were made before the last frame, and are still under way; for all of a played recording's."""
     played, start_ns = sensors.played, sensors.start.time_ns
-    if played is not None and played.reads.num_reads and start_ns is not None and config.address is None:
-        after_s = 1e-9 * (int(played.reads.time_ns[-1]) - int(played.time_ns[-1]))
-        until += max(0.0, after_s)
-    await asyncio.sleep(max(0.0, until - time.monotonic()))
+    if played is None or start_ns is None or config.address is not None:
+        await asyncio.sleep(_LAST_READS_S)
+        return
+    last, until = -1, 0.0
+    while (taken := progress.num_taken) < played.reads.num_reads:
+        now = time.monotonic()
+        if taken > last:
+            last, until = taken, now + _QUIET_S + config.emulator.jitter_s
+        if now > until:
+            return
+        await asyncio.sleep(_POLL_S)
 
 
 def _summary(finished: Finished) -> dict[str, Any]:
