@@ -137,6 +137,13 @@ def test_frames_are_scored_alike_everywhere() -> None:
     assert from_mapping(ScoreSettings, scores[0]) == ScoreSettings()
 
 
+def test_an_evaluation_takes_a_tracer_to_compare_with() -> None:
+    beside = composed("evaluate", "tracer=tagattention", "tracer@baselines.published=tagattention_published")
+    assert beside["baselines"]["published"] == composed("train")["baselines"]["published"]
+    assert composed("evaluate")["baselines"] is None  # those of the run
+    assert composed("evaluate", "baselines={}")["baselines"] == {}
+
+
 @pytest.mark.parametrize(
     ("command", "override", "known"),
     [

@@ -12,7 +12,7 @@ from scipy.special import expit
 
 from tagjax.radio.arrivals import Arrivals
 from tagjax.tagattention.segments import Detection
-from tagjax.tagattention.segments.detection import Explanations, RecentReads
+from tagjax.tagattention.segments.detection import Explanations, RecentReads, best_of_segments
 from tagjax.tracing.status import Status
 
 
@@ -122,6 +122,12 @@ def test_a_status_leaves_gradients_alone_and_is_the_same_in_a_compiled_batch():
     alone = jax.grad(confidences, argnums=(0, 1, 2, 3))(*given)
     for found, expected in zip(gradient, alone, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
+
+
+def test_the_best_segment_moves_and_without_one_its_evidence_is_none() -> None:
+    nats = jnp.asarray([[9.0, -3.0, 2.0], [9.0, -1.0, -4.0]])
+    np.testing.assert_allclose(best_of_segments(nats, jnp.asarray([False, True, True])), [2.0, -1.0])
+    np.testing.assert_allclose(best_of_segments(nats, jnp.zeros(3, bool)), [0.0, 0.0])
 
 
 def test_recent_reads_are_counted_for_their_tag():

@@ -17,6 +17,7 @@ from report_runs import NUM_FRAMES, report_run
 from tagjax.report.page import PAGE, pictures, write_page
 from tagjax.report.page.contents import read_contents
 from tagjax.report.page.html import element
+from tagjax.report.page.sections import readable_top
 from tagjax.report.page.states import (
     DETECTED,
     IDENTIFIED,
@@ -265,6 +266,14 @@ def test_the_worst_tag_comes_first_with_the_middle_of_its_longest_failure() -> N
     assert (found[0].recording, found[0].failed, found[0].frame) == ("a", (12, 15), 13)
     assert found[2].score == pytest.approx(0.75)
     assert len(worst_cases([("a", [good, bad]), ("b", [middling])], 1)) == 1
+
+
+def test_a_few_large_errors_do_not_flatten_a_chart() -> None:
+    small = np.linspace(0.0, 5.0, 30)
+    assert readable_top(small) == (None, False)
+    assert readable_top(np.array([*small, 350.0, np.nan])) == (10.0, True)
+    assert readable_top(np.array([*small, *(30.0 * small)])) == (None, False)  # no exception: many are large
+    assert readable_top(np.full(3, np.nan)) == (None, False)
 
 
 def test_runs_of_values() -> None:

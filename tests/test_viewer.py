@@ -61,8 +61,19 @@ def test_the_file_holds_reads_pictures_and_what_was_traced(path: Path, tmp_path:
         np.testing.assert_allclose([time for time, _ in phases], reads.time_ns - scene(40).time_ns[0], atol=1000)
         confidence = [value[0] for _, value in _logged(out, f"/confidence/{epc}")]
         np.testing.assert_allclose(confidence, [trace.confidence[tag] for _, trace in traces])
+        for name in ("body", "stationary", "free", "best_segment"):
+            nats = [value[0] for _, value in _logged(out, f"/evidence/{epc}/{name}")]
+            np.testing.assert_allclose(nats, [getattr(trace.evidence, name)[tag] for _, trace in traces])
+        assert len(_logged(out, f"/log_odds/{epc}")) == 40
     assert len(_logged(out, "/camera/picture/masks")) == 40
     assert any("detected" in value[0] for _, value in _logged(out, "/status"))
+
+
+def test_log_odds_are_shown_in_whole_nats() -> None:
+    nats = np.array([[-30.0, -8.4, -1.2, 0.0], [0.4, 2.6, 7.6, 30.0]])
+    classes = viewer.log_odds_classes((1.0 / (1.0 + np.exp(-nats))).astype(np.float32))
+    assert classes.tolist() == [[1, 1, 8, 9], [9, 12, 17, 17]]
+    assert viewer.log_odds_classes(np.array([[0.0, 1.0]], np.float32)).tolist() == [[0, 17]]
 
 
 def test_a_missing_package_is_reported_before_the_work(

@@ -81,12 +81,12 @@ def write_stages(folder: Path, recording: Recording, picture: Picture, camera: C
         rd_m, std_m = np.asarray(frames.radio.relative_m[-1, tag, 0]), np.asarray(frames.radio.std_m[-1, tag, 0])
         valid = motion.valid & motion.valid[..., :1] & jnp.isfinite(jnp.asarray(std_m))[None, None]
         agreement = np.asarray(_attention(rho_m, jnp.asarray(rd_m), valid))
-        read = np.isfinite(std_m).any()
-        measured = f"the tag's by {tag_mm[tag]:+.0f} mm" if read else "the tag is not read"
+        if not np.isfinite(std_m).any():  # not read: without a distance of the tag nothing can agree
+            continue
         shown.append(
             (
                 f"attention of {short_name(epc)}",
-                f"pixels whose distance changes as the tag's does (Eq. 6); {measured} over {window} frames",
+                f"pixels whose distance changes as the tag's does (Eq. 6), here by {tag_mm[tag]:+.0f} mm over {window} frames",
                 grey(np.where(np.asarray(valid).any(axis=-1), agreement, 0.0)),
             )
         )

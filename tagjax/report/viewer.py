@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from ..core.camera import working_stride
 from ..core.settings import ConfigError
@@ -16,9 +17,21 @@ from ..tracing.clips import subsampled_depth
 from ..tracing.status import Status, status_or_detected
 from ..tracing.tracer import Trace
 from .overlay import PALETTE_RGB, short_name
+from .stages import change_colours
 
 _JPEG_QUALITY = 70
 _TIME = "time"
+
+_EXPLANATIONS = {
+    "body": ("on its body", (0, 114, 178)),
+    "stationary": ("stationary", (204, 121, 167)),
+    "free": ("a path of its own", (150, 150, 150)),
+    "best_segment": ("best segment", (230, 159, 0)),
+}
+"""The lines of a tag's evidence: fields of `Evidence` with their names and colours."""
+
+_MOST_NATS = 8
+"""Log odds of pixels are shown up to these, in whole nats."""
 
 
 def rerun() -> Any:
@@ -49,7 +62,7 @@ def log_recording(
     """
     rr = rerun()
     stream = rr.RecordingStream("tagjax")
-    stream.send_blueprint(_blueprint())
+    stream.send_blueprint(_blueprint(epcs, depth=depth))
     if out is None:
         stream.spawn()
     else:
@@ -62,14 +75,23 @@ def log_recording(
             stream.set_time(_TIME, duration=float(recording.frame_time_s()[number]))
             _log_picture(rr, stream, recording, number, stride, depth=depth)
             _log_trace(rr, stream, recording, trace, epcs, antennas, stride)
+            _log_evidence(rr, stream, trace, epcs)
     finally:
         stream.flush()
         stream.disconnect()
 
 
-def _blueprint() -> Any:
+def _blueprint(epcs: Sequence[str], *, depth: bool) -> Any:
+    """The panels. Below the picture stand space and log odds as tabs, of which the fuller one is open."""
     from rerun import blueprint as view
 
+    space = view.Spatial3DView(origin="/", contents=["/camera/**", "/antennas", "/places/**"], name="space")
+    log_odds = [
+        view.Spatial2DView(origin=_of(epc, "log_odds"), name=f"log odds of {short_name(epc)}, nats") for epc in epcs
+    ]
+    evidence = [
+        view.TimeSeriesView(origin=_of(epc, "evidence"), name=f"evidence for {short_name(epc)}, nats") for epc in epcs
+    ]
     curves = [
         view.TimeSeriesView(origin=f"/{name}", name=title)
         for name, title in (
@@ -82,9 +104,9 @@ def _blueprint() -> Any:
         view.Horizontal(
             view.Vertical(
                 view.Spatial2DView(origin="/camera/picture", name="picture"),
-                view.Spatial3DView(origin="/", contents=["/camera/**", "/antennas", "/places/**"], name="space"),
+                view.Tabs(space, *log_odds, active_tab=0 if depth else 1),
             ),
-            view.Vertical(*curves, view.TextLogView(origin="/status", name="status")),
+            view.Vertical(*curves, view.Tabs(*evidence), view.TextLogView(origin="/status", name="status")),
         ),
         collapse_panels=True,
     )
@@ -117,6 +139,9 @@ def _log_scene(
         points = rr.SeriesPoints(colors=colour, names=short_name(epc), marker_sizes=3)
         stream.log(_of(epc, "phase"), points, static=True)
         stream.log(_of(epc, "rssi"), points, static=True)
+        for name, (title, shade) in _EXPLANATIONS.items():
+            stream.log(f"{_of(epc, 'evidence')}/{name}", rr.SeriesLines(colors=shade, names=title), static=True)
+    stream.log("/log_odds", rr.AnnotationContext(_log_odds_classes()), static=True)
 
 
 def _log_reads(rr: Any, stream: Any, recording: Recording, epcs: Sequence[str], antennas: Sequence[int]) -> None:
@@ -175,6 +200,35 @@ def _log_trace(
     status = status_or_detected(trace.status, trace.detected)
     words = ", ".join(f"{short_name(epc)} {Status(int(code)).text}" for epc, code in zip(epcs, status, strict=True))
     stream.log("/status", rr.TextLog(words))
+
+
+def _log_evidence(rr: Any, stream: Any, trace: Trace, epcs: Sequence[str]) -> None:
+    """The evidence for each explanation, where the tracer compares some, and each pixel's log odds of the tag's object."""
+    for tag, epc in enumerate(epcs):
+        if trace.evidence is not None:
+            for name in _EXPLANATIONS:
+                nats = float(getattr(trace.evidence, name)[tag])
+                stream.log(f"{_of(epc, 'evidence')}/{name}", rr.Scalars(nats))
+        stream.log(_of(epc, "log_odds"), rr.SegmentationImage(log_odds_classes(np.asarray(trace.mask[tag]))))
+
+
+def log_odds_classes(mask: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    """The class of each pixel: 0 where the soft mask is 0, else its log odds in whole nats, 1 for -8 and less to 17 for 8 and more."""
+    inside = np.clip(mask.astype(np.float64), 1e-12, 1.0 - 1e-12)
+    nats = np.clip(np.rint(np.log(inside) - np.log1p(-inside)), -_MOST_NATS, _MOST_NATS)
+    return np.where(mask > 0, nats + _MOST_NATS + 1, 0).astype(np.uint8)
+
+
+def _log_odds_classes() -> list[tuple[int, str, tuple[int, int, int]]]:
+    """Number, name and colour of each class: blue against the object, white for even odds, orange for it."""
+    nats = np.arange(-_MOST_NATS, _MOST_NATS + 1)
+    colours = change_colours(nats[None].astype(float), float(_MOST_NATS))[0].tolist()
+    named = {-_MOST_NATS: f"-{_MOST_NATS} nats or less", _MOST_NATS: f"+{_MOST_NATS} nats or more"}
+    rows = [
+        (number + 1, named.get(one, f"{one:+d} nats"), tuple(colours[number]))
+        for number, one in enumerate(nats.tolist())
+    ]
+    return [(0, "not followed", (0, 0, 0)), *rows]
 
 
 def _of(epc: str, name: str) -> str:

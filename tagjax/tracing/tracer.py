@@ -99,6 +99,15 @@ class Frame(eqx.Module):
         )
 
 
+class Evidence(eqx.Module):
+    """Log likelihoods of a tag's recent reads, nats against phases at random: of three explanations, and of one segment."""
+
+    body: Float[Array, "*time tag"]  # the tag moves with the body that its mask shows; 0 without one
+    stationary: Float[Array, "*time tag"]  # it stays in place
+    free: Float[Array, "*time tag"]  # it moves on a smooth path of its own, whatever is in view
+    best_segment: Float[Array, "*time tag"]  # it moves with the segment that explains its reads best; 0 without one
+
+
 class Trace(eqx.Module):
     """The output of a tracer at one frame, for every tag; `trace` stacks it over time."""
 
@@ -110,6 +119,7 @@ class Trace(eqx.Module):
     confidence: Float[Array, "*time tag"]  # 0 to 1
     detected: Bool[Array, "*time tag"]  # the confidence exceeds the detection threshold
     status: Int8[Array, "*time tag"] | None = None  # codes of `Status`; None: the tracer gives no reasons
+    evidence: Evidence | None = None  # None: the tracer compares no explanations
 
 
 class AbstractTracer(eqx.Module):

@@ -13,8 +13,8 @@ from ..overlay import short_name
 from .html import Html, element, together
 from .states import STATES, TagFrames, runs
 
-_WIDTH, _HEIGHT = 440, 200
-_LEFT, _RIGHT, _TOP, _BOTTOM = 40, 10, 8, 34
+_WIDTH, _HEIGHT = 440, 204
+_LEFT, _RIGHT, _TOP, _BOTTOM = 40, 10, 8, 38
 _TICKS = 4
 
 
@@ -45,7 +45,7 @@ def line_chart(
     """
     known = np.concatenate([one for line in lines for one in (line.y, line.high) if one is not None] or [np.zeros(0)])
     known = known[np.isfinite(known)]
-    high = top if top is not None else _round_up(float(known.max(initial=0.0)))
+    high = top if top is not None else round_up(float(known.max(initial=0.0)))
     low = bottom if bottom is not None else float(np.floor(known.min(initial=0.0)))
     first, last = (float(x[0]), float(x[-1])) if len(x) else (0.0, 1.0)
 
@@ -115,7 +115,7 @@ def _area(x: np.ndarray, low: np.ndarray, high: np.ndarray, across, down) -> str
     return f"M{' L'.join(there + back)}Z"
 
 
-def _round_up(value: float) -> float:
+def round_up(value: float) -> float:
     """The next of 1, 2, 4, 10, 20, 40, ..., so that four steps are round numbers."""
     if value <= 0:
         return 1.0

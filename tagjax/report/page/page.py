@@ -61,7 +61,7 @@ def page_text(contents: Contents, path: Path, on_progress: OnProgress = unobserv
 def _title(contents: Contents) -> str:
     recordings = contents.recordings()
     where = recordings[0] if len(recordings) == 1 else f"{len(recordings)} recordings"
-    return f"{contents.tracers[0]} on {where}"
+    return f"Report on {where}"
 
 
 def _recordings(contents: Contents, shown: list[str], path: Path, on_progress: OnProgress) -> Html:

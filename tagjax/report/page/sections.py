@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..overlay import short_name
 from ..video import read_video
-from .charts import Line, fraction_bar, line_chart, timeline
+from .charts import Line, fraction_bar, line_chart, round_up, timeline
 from .contents import Contents
 from .html import Html, data_uri, element, table, together
 from .pictures import jpeg
-from .states import IDENTIFIED, STATES, WRONG, TagFrames, lost_iou, worst_cases
+from .states import IDENTIFIED, STATES, WRONG, Case, TagFrames, lost_iou, worst_cases
 
 NUM_WORST = 6
 
@@ -46,7 +47,7 @@ def headline(contents: Contents) -> Html:
     about = f"{_count(len(recordings), 'recording')}, {_count(tags, 'tag')}, {_count(frames, 'frame')}"
     counted = scores["all"].get("num_frames") or 0
     if not counted:
-        text = f"{tracer}: {about}. No frame has a truth to compare with, so there are detections and no scores."
+        text = f"Tracer {tracer}: {about}. No frame has a truth to compare with, so there are detections and no scores."
         return together(element("p", text, class_="lead"))
     figures = []
     for name, label, meaning in _MEASURES[:4]:
@@ -56,7 +57,7 @@ def headline(contents: Contents) -> Html:
             element("div", element("dt", label), element("dd", number(scores["all"].get(name)), between), title=meaning)
         )
     text = (
-        f"{tracer}: {about}. Scores are over {_count(counted, 'frame')} of tags: from a tag's first motion on, while its "
+        f"Tracer {tracer}: {about}. Scores are over {_count(counted, 'frame')} of tags: from a tag's first motion on, while its "
         "whole object is visible."
     )
     parts = [element("p", text, class_="lead"), element("dl", *figures, class_="figures")]
@@ -97,7 +98,7 @@ def worst(contents: Contents) -> Html | None:
             element("p", f"{case.recording}, tag {case.tag.epc}"),
             element(
                 "p",
-                f"Failed longest in frames {case.failed[0]} to {case.failed[1]}. Of {int(counts.sum())} frames: {lines}.",
+                f"{_failure(case)}. Of {_count(int(counts.sum()), 'frame')}: {lines}.",
             ),
         ]
         go = element(
@@ -112,6 +113,13 @@ def worst(contents: Contents) -> Html | None:
     if not cards:
         return element("p", "No tag that counts failed at any frame.")
     return element("ol", *cards, class_="cards")
+
+
+def _failure(case: Case) -> str:
+    """What failed for longest, and when."""
+    first, last = case.failed
+    when = f"at frame {first}" if first == last else f"in frames {first} to {last}"
+    return f"Longest failure: {'box IoU below 0.5' if case.tag.label else 'no detection'} {when}"
 
 
 def _frame(video: Path, place: int) -> np.ndarray:
@@ -131,7 +139,7 @@ def budget(contents: Contents) -> Html | None:
         shown = [("box IoU", "kept", 1.0 - sum(lost.values()))]
         words = {IDENTIFIED: "right object, but the box differs", WRONG: "another object or the background"}
         shown += [
-            (f"lost: {words.get(state, state.name)}", state.style, loss)
+            (words.get(state, f"not detected: {state.name}"), state.style, loss)
             for state, loss in lost.items()
             if loss > 0.0005
         ]
@@ -163,16 +171,29 @@ def motion(contents: Contents) -> Html | None:
                 longest = max(longest, len(mean))
         if lines:
             lines = [_padded(line, longest) for line in lines]
-            charts.append(
-                line_chart(
-                    title,
-                    np.arange(longest, dtype=float),
-                    lines,
-                    x_label="frames since the tag's first motion",
-                    top=top,
-                )
-            )
+            frames = np.arange(longest, dtype=float)
+            charts.append(_score_chart(title, frames, lines, x_label="frames since the tag's first motion", top=top))
     return element("div", *charts, class_="charts") if charts else None
+
+
+def _score_chart(title: str, frames: np.ndarray, lines: Sequence[Line], *, top: float | None, **more: Any) -> Html:
+    """A chart of a score. Without `top` a few large values do not flatten the others: they are drawn at the edge."""
+    if top is None:
+        top, cut = readable_top(np.concatenate([line.y for line in lines]))
+        title += f", cut at {top:g}" if cut else ""
+    return line_chart(title, frames, lines, top=top, **more)
+
+
+def readable_top(values: Float[np.ndarray, " point"]) -> tuple[float | None, bool]:
+    """The upper end of an axis, None for that of the data, and whether it cuts off the largest values.
+
+    It cuts where the 90th percentile, or 10 if that is less, would fill less than a half of the axis.
+    """
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None, False
+    most = round_up(max(10.0, float(np.percentile(values, 90))))
+    return (most, True) if round_up(float(values.max())) > 2 * most else (None, False)
 
 
 def _padded(line: Line, length: int) -> Line:
@@ -224,7 +245,7 @@ def _curves(tags: Sequence[TagFrames]) -> list[Html]:
             for place, tag in enumerate(tags)
             if tag.label
         ]
-        drawn.append(line_chart(title, frames, lines, x_label="frame (gap: does not count)", top=top, cursor=True))
+        drawn.append(_score_chart(title, frames, lines, x_label="frame (gap: does not count)", top=top, cursor=True))
     return drawn
 
 

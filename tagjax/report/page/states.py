@@ -27,7 +27,7 @@ WRONG = State("wrong object", "detected on another object or the background", "w
 OCCLUDED = State("occluded", "the body that carries the tag is out of view", "occluded", 0.5)
 STATIONARY = State("stationary", "the reads are those of a tag that stays in place", "stationary", 0.35)
 NOT_READ = State("not read", "few reads of late, or none", "unread", 0.2)
-LOST = State("lost", "not detected: the reads fit no body, or no reason is given", "lost", 0.06)
+LOST = State("not found", "the reads fit no body in view, or no reason is given", "lost", 0.1)
 
 STATES = (IDENTIFIED, DETECTED, WRONG, OCCLUDED, STATIONARY, NOT_READ, LOST)
 """From the best to the worst; each differs from the others by colour and by height."""

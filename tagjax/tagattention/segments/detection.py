@@ -46,6 +46,14 @@ class Explanations(eqx.Module):
     free: Float[Array, " tag"]
 
 
+def best_of_segments(
+    evidence_nats: Float[Array, "tag segment"], moving: Bool[Array, " segment"]
+) -> Float[Array, " tag"]:
+    """Each tag's largest evidence among the `moving` segments, 0 where there is none; no gradient. It is shown, not used."""
+    best = jnp.max(jnp.where(moving, evidence_nats, -jnp.inf), axis=1)
+    return jax.lax.stop_gradient(jnp.where(jnp.any(moving), best, 0.0))
+
+
 class Detection(eqx.Module):
     """Stage that decides which tags are detected. `Detection()` has good values."""
 

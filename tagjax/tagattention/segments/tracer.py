@@ -26,11 +26,11 @@ from ...core.constrained import named_values, with_named_values
 from ...core.numerics import safe_divide
 from ...radio.reader_model import ReaderModel
 from ...tracing.status import Status
-from ...tracing.tracer import AbstractSmoother, Camera, Frame, Trace
+from ...tracing.tracer import AbstractSmoother, Camera, Evidence, Frame, Trace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody, LaterBody
 from .cut import cut_segments
-from .detection import Detection, Explanations, RecentReads
+from .detection import Detection, Explanations, RecentReads, best_of_segments
 from .dwell import DwellEvidence, DwellState
 from .free_path import FreePath, FreePathState
 from .given import without_joined
@@ -69,6 +69,16 @@ class Association(eqx.Module):
     confidence: Float[Array, " tag"]
     detected: Bool[Array, " tag"]
     status: Int8[Array, " tag"]  # codes of `Status`
+    best_nats: Float[Array, " tag"]  # evidence for the segment that explains the reads best; 0 without a segment
+
+    def evidence(self) -> Evidence:
+        """The evidence for each explanation that `Detection` compares, and for the best segment."""
+        return Evidence(
+            body=self.body_nats,
+            stationary=self.stationary_nats,
+            free=self.free_nats,
+            best_segment=self.best_nats,
+        )
 
 
 class SegmentTrace(eqx.Module):
@@ -78,6 +88,11 @@ class SegmentTrace(eqx.Module):
     box_px: Float[Array, "tag 4"]
     centre_px: Float[Array, "tag 2"]
     tags: Association
+
+
+def moving_segments(area: Float[Array, " segment"]) -> Bool[Array, " segment"]:
+    """The segments that are in view and not the static background."""
+    return (area > 0) & (jnp.arange(area.shape[0]) != STATIC)
 
 
 class TagAttention(AbstractSmoother):
@@ -152,6 +167,7 @@ class TagAttention(AbstractSmoother):
             confidence=tags.confidence,
             detected=tags.detected,
             status=tags.status,
+            evidence=tags.evidence(),
         )
 
     def follow(self, camera: Camera, state: TagAttentionState, frame: Frame) -> tuple[TagAttentionState, SegmentTrace]:
@@ -278,6 +294,7 @@ class TagAttention(AbstractSmoother):
             confidence=confidence,
             detected=detected,
             status=jnp.where(frame.present, status, jnp.int8(Status.UNKNOWN)),
+            best_nats=best_of_segments(evidence, moving_segments(found.area)),
         )
 
     def _evidence(
@@ -331,8 +348,7 @@ class TagAttention(AbstractSmoother):
     ) -> tuple[BodyState | None, Float[Array, "tag segment"], Float[Array, "tag segment"]]:
         """The state of the bodies, the probability that each segment belongs to each tag's, and that of the tag's place."""
         if self.body is None or state is None:
-            moving = (found.area > 0) & (jnp.arange(found.area.shape[0]) != STATIC)
-            membership = cut_segments(log_likelihood, moving)
+            membership = cut_segments(log_likelihood, moving_segments(found.area))
             return None, membership, membership * found.area[None]
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
         state, bodies = self.body.step(state, evidence, found, since_s, now_s, later)
