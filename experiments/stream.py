@@ -34,6 +34,7 @@ def main(values: dict[str, Any], folder: Path) -> None:
     def shown(address: str) -> None:
         console.print(f"the page: {address}", soft_wrap=True, highlight=False)
 
+    console.print("The tracer is compiled first: half a minute, more on a busy machine.", highlight=False)
     with progress_lines(shown=progress, console=console) as report:
         summary = run_stream(config, folder, on_progress=report, on_page=shown)
     console.print(

@@ -105,6 +105,40 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert "unfinished" not in attributes
 
 
+def test_frames_that_arrive_late_keep_the_times_of_their_camera(tmp_path: Path) -> None:
+    """A host so busy that a frame arrives up to a second late: the camera's clock is right but for the smallest delay."""
+    recording, path, late_ns = small_recording(5.0, frame_rate_hz=10.0), tmp_path / "a.zarr", 3_000_000
+    writer, random = writer_of(recording, path), np.random.default_rng(0)
+    delays_ns = np.rint(random.uniform(0.1e9, 1e9, recording.num_frames)).astype(np.int64)
+    delays_ns[20] = late_ns
+    arrivals_ns = np.maximum.accumulate(recording.time_ns + delays_ns) + np.arange(recording.num_frames)
+    device_ns = recording.time_ns + 7 * 10**12
+    for number in range(recording.num_frames):
+        stamps = int(arrivals_ns[number]), int(device_ns[number])
+        writer.add_frame(recording.colour[number], recording.depth[number], *stamps)
+    writer.add_reads(captured(recording))
+    writer.close()
+    finished = finish_recording(path)
+    found = open_recording(path)
+    np.testing.assert_array_equal(found.time_ns, recording.time_ns + int(np.min(arrivals_ns - recording.time_ns)))
+    assert finished.frames is not None
+    assert "smallest delay" in finished.frames.note
+
+
+def test_a_camera_whose_clock_was_set_anew_has_the_times_of_arrival(tmp_path: Path) -> None:
+    recording, path = small_recording(3.0, frame_rate_hz=10.0), tmp_path / "a.zarr"
+    writer, random = writer_of(recording, path), np.random.default_rng(0)
+    delays_ns = np.rint(random.uniform(0, 9e7, recording.num_frames)).astype(np.int64)
+    for number in range(recording.num_frames):
+        stamp = int(recording.time_ns[number])
+        shown = stamp + (10**13 if number % 7 > 3 else 0) + number * 10**11  # another clock at every look
+        writer.add_frame(recording.colour[number], recording.depth[number], stamp + int(delays_ns[number]), shown)
+    writer.add_reads(captured(recording))
+    writer.close()
+    finish_recording(path)
+    np.testing.assert_array_equal(open_recording(path).time_ns, recording.time_ns + delays_ns)
+
+
 def test_the_folder_opens_at_every_commit_and_shows_that_commit(tmp_path: Path) -> None:
     recording, path = small_recording(2.0), tmp_path / "a.zarr"
     writer, reads = writer_of(recording, path), captured(recording)

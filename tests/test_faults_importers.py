@@ -88,7 +88,7 @@ def test_the_report_gives_the_first_line_numbers_of_each_reason(tmp_path: Path) 
     _, _, report = _import(tmp_path / "table", lines)
     assert report.lines()[1:3] == [
         "rejected 7: EPC is not hexadecimal (lines 4, 6, 8, 10, 12, ...)",
-        "rejected 1: columns are missing (line 21)",
+        "rejected 1: columns are missing: epc (line 21)",
     ]
 
 
@@ -210,7 +210,7 @@ def test_whatever_parsing_raises_rejects_the_row() -> None:
     for line, error in enumerate((RecursionError(), SyntaxError(), OverflowError(), MemoryError(), KeyError("a"))):
         assert parsed(fails(error), "", line, rejected) is None
     assert rejected.count == 5
-    assert "1: columns are missing (line 4)" in rejected.texts()
+    assert "1: columns are missing: a (line 4)" in rejected.texts()
     with pytest.raises(OSError, match="disk"):
         parsed(fails(OSError("disk")), "", 0, rejected)
     with pytest.raises(RowError, match="not CSV"):

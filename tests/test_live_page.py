@@ -61,9 +61,10 @@ def test_a_frame_is_its_figures_and_its_picture(page):
     assert answer.status == 200
     state, picture = taken_apart(body)
     assert state["number"] == 7
-    assert [tag["epc"] for tag in state["tags"]] == list(TAGS)
-    assert [tag["reads_hz"] for tag in state["tags"]] == [45.2, 61.0, 0.0, 0.0]
-    assert state["tags"][0]["distance_m"] == pytest.approx(np.sqrt(0.09 + 0.04 + 5.76), abs=0.01)
+    assert [tag["epc"] for tag in state["tags"]] == sorted(TAGS)
+    assert [tag["colour"] for tag in state["tags"]] == [1, 0, 2, 3]  # as in the picture
+    assert [tag["reads_hz"] for tag in state["tags"]] == [61.0, 45.2, 0.0, 0.0]
+    assert state["tags"][1]["distance_m"] == pytest.approx(np.sqrt(0.09 + 0.04 + 5.76), abs=0.01)
     assert state["tags"][2]["distance_m"] is None
     assert state["tags"][3]["text"].startswith("stationary")
     assert [event["kind"] for event in state["events"]] == ["alarm", "lost", "detected"]
@@ -94,6 +95,15 @@ def test_a_smaller_picture_has_masks_and_boxes_at_the_same_places():
         # The edges of the box, 160 to 319 and 120 to 399, and of its line, two pixels wide.
         np.testing.assert_allclose(columns[[0, -1]], [160 * factor, 319.5 * factor], atol=2.1)
         np.testing.assert_allclose(rows[-1], 399.5 * factor, atol=2.1)
+
+
+def test_before_the_first_frame_the_answer_says_so(page, monkeypatch):
+    monkeypatch.setattr("tagjax.live.page.server._WAIT_S", 0.05)
+    answer, _ = ask(page, "/frame")
+    assert (answer.status, answer.headers["Tagjax-State"]) == (204, "starting")
+    page.show(view(1))
+    answer, _ = ask(page, "/frame")
+    assert (answer.status, answer.headers["Tagjax-State"]) == (200, None)
 
 
 def test_figures_that_are_not_finite_are_null(page):
@@ -168,15 +178,18 @@ def test_browsers_that_take_nothing_hold_up_nobody(page):
         client.sendall(b"GET /frame HTTP/1.1\r\nHost: localhost\r\n\r\n" * 50)  # and reads no answer
         lazy.append(client)
     slowest = 0.0
-    for number in range(2, 200):
-        begun = time.monotonic()
-        page.due()
-        page.show(view(number, num_tags=1))
-        slowest = max(slowest, time.monotonic() - begun)
-    assert slowest < 1.0
-    assert ask(page, "/")[0].status == 200  # there is room for another
-    for client in lazy:
-        client.close()
+    try:
+        for number in range(2, 200):
+            begun = time.monotonic()
+            page.due()
+            page.show(view(number, num_tags=1))
+            slowest = max(slowest, time.monotonic() - begun)
+        # Such a browser is given up after 15 s: what waits for it takes as long, what does not only waits for the processor.
+        assert slowest < 5.0
+        assert ask(page, "/")[0].status == 200  # there is room for another
+    finally:
+        for client in lazy:
+            client.close()
 
 
 def test_the_number_of_connections_is_bounded(page):

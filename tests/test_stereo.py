@@ -343,6 +343,6 @@ def test_inputs_that_are_missing_or_contradict_each_other(tmp_path: Path) -> Non
     with pytest.raises(RecordingError, match="no picture"):
         open_pictures(tmp_path, "left", None)
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(RecordingError, match="give the frame rate: fps=30"):
+    with pytest.raises(RecordingError, match=r"look like frame numbers.*give the frame rate: fps=30"):
         open_pictures(tmp_path, "left", None)
     assert open_pictures(tmp_path, "left", 30.0)[0].shape == (1, 4, 4, 3)

@@ -5,18 +5,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ..core.camera import Intrinsics
 from ..core.settings import ConfigError
 from ..recording import Recording
-from ..recording.capture.camera import CameraSettings
-from ..recording.capture.emulation import EmulatorSettings
-from ..recording.capture.r700 import TlsSettings
-from ..recording.capture.reader import ConnectionSettings, InventorySettings
-from ..recording.capture.settings import SensorConfig
+from ..recording.capture.settings import CameraKind, ReaderKind, SensorConfig, SensorSettings
 from ..recording.store import open_recording
 from ..tracing.clips import choose_antennas, selected_tags
 from ..tracing.replay import Replay, ReplaySettings
@@ -26,13 +22,12 @@ from .sensors import SensorStream
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StreamConfig:
+class StreamConfig(SensorSettings):
     """What is traced, and the tracer (settings as under conf/tracer, or learned weights).
 
     Without camera and reader `recording` is replayed. Raises `ConfigError` for settings that do not fit together.
     """
 
-    recording: str | None = None  # that is replayed, or that playback and an emulated reader play
     tracer: Mapping[str, Any]
     weights: str | None = None
     flow: str = "dis_live"
@@ -40,18 +35,10 @@ class StreamConfig:
     num_places: int = 4  # for tags, before more are made
     antennas: tuple[int, ...] | None = None  # whose reads are used; None: the one with most reads, or the first port
     replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)
-    camera: Literal["playback", "realsense", "orbbec", "k4a"] | None = None
-    reader: Literal["llrp", "r700", "playback"] | None = None
+    camera: CameraKind | None = None
+    reader: ReaderKind | None = None
     record: str | None = None  # a new recording of what the sensors give
     reads_wait_s: float = 0.02  # of a frame, for reads that are under way
-    address: str | None = None  # the reader's; this and what follows as in `SensorConfig`
-    emulate: bool = False
-    antennas_m: tuple[tuple[float, float, float], ...] | None = None
-    camera_settings: CameraSettings = dataclasses.field(default_factory=CameraSettings)
-    inventory: InventorySettings = dataclasses.field(default_factory=InventorySettings)
-    connection: ConnectionSettings = dataclasses.field(default_factory=ConnectionSettings)
-    tls: TlsSettings = dataclasses.field(default_factory=TlsSettings)
-    emulator: EmulatorSettings = dataclasses.field(default_factory=EmulatorSettings)
     events: EventSettings = dataclasses.field(default_factory=EventSettings)
     page: PageSettings = dataclasses.field(default_factory=PageSettings)
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..core.errors import RecordingError
 from ..recording.computed_frames import ComputedFrames
-from ..recording.image_files import natural_sorted, read_colour
-from ..recording.importers.read_values import stamp_ns
-from ..recording.importers.rows import RowError
+from ..recording.image_files import read_colour
+from ..recording.importers.rgbd.times import PICTURES, picture_files, times_of_names
+from ..recording.video_files import VIDEOS, check_whole, frame_time_ns, num_stated_frames, opened_video
 
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-
-_NOT_A_TIME = 10**7  # picture names up to here are numbers of frames
+_COLOUR = tuple(ending for ending in PICTURES if ending != ".npy")
 
 
 def open_pictures(path: str | Path, side: str, fps: float | None) -> tuple[ComputedFrames, np.ndarray]:
@@ -39,10 +35,13 @@ def open_pictures(path: str | Path, side: str, fps: float | None) -> tuple[Compu
 
 
 def _open_folder(folder: Path, side: str, fps: float | None) -> tuple[ComputedFrames, np.ndarray]:
-    files = natural_sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES and path.is_file())
-    if not files:
-        raise RecordingError(f"{side}={folder}: no picture; expected files that end in {', '.join(PICTURES)}.")
-    times = _constant(len(files), fps) if fps is not None else _times_of_names(files, side)
+    where = f"{side}={folder}"
+    files = picture_files(folder, where, _COLOUR)
+    if fps is not None:
+        times = _constant(len(files), fps)
+    else:
+        advice = "Otherwise give the frame rate: fps=30."
+        times = np.array(times_of_names(files, where, advice=advice), np.int64)
     shape = read_colour(files[0]).shape
 
     def decode(frame: int) -> np.ndarray:
@@ -55,21 +54,6 @@ def _open_folder(folder: Path, side: str, fps: float | None) -> tuple[ComputedFr
         return picture
 
     return ComputedFrames((len(files), *shape), np.uint8, decode), times
-
-
-def _times_of_names(files: list[Path], side: str) -> np.ndarray:
-    stems = [path.stem for path in files]
-    if all(stem.isdigit() and int(stem) < _NOT_A_TIME for stem in stems):
-        raise RecordingError(
-            f"{side}={files[0].parent}: names such as {files[0].name} are no times; give the frame rate: fps=30."
-        )
-    try:
-        return np.array([stamp_ns(stem) for stem in stems], np.int64)
-    except RowError as error:
-        raise RecordingError(
-            f"{side}={files[0].parent}: the names are no times ({error}); give the frame rate (fps=30), or name pictures by seconds "
-            "since 1970."
-        ) from error
 
 
 def _constant(count: int, fps: float) -> np.ndarray:
@@ -85,25 +69,14 @@ class _Video:
 
     def _open(self) -> None:
         self.next = 0
-        self.capture = cv2.VideoCapture(str(self.path.resolve()), cv2.CAP_FFMPEG)
-        if not self.capture.isOpened():
-            raise RecordingError(
-                f"{self.side}={self.path}: no readable video ({self.path.stat().st_size} bytes); it is truncated, or its codec is "
-                "unknown. Copy it again, or convert it."
-            )
+        self.capture = opened_video(self.path, f"{self.side}={self.path}")
 
     def times_and_shape(self) -> tuple[np.ndarray, tuple[int, int, int]]:
         """The container's times of all frames that can be decoded, and the shape of a picture. Decodes the video once."""
-        stated, times, shape = int(self.capture.get(cv2.CAP_PROP_FRAME_COUNT)), [], None
+        stated, times = num_stated_frames(self.capture), []
         while self.capture.grab():
-            times.append(round(self.capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
-        if not times:
-            raise RecordingError(f"{self.side}={self.path}: no frame can be decoded. Copy the video again.")
-        if len(times) < 0.98 * stated - 1:
-            raise RecordingError(
-                f"{self.side}={self.path}: {len(times)} of {stated} frames can be decoded; the video is truncated or damaged. Copy it "
-                "again."
-            )
+            times.append(frame_time_ns(self.capture))
+        check_whole(f"{self.side}={self.path}", len(times), stated)
         self._open()
         shape = self(0).shape
         return np.array(times, np.int64), (int(shape[0]), int(shape[1]), 3)

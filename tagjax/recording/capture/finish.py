@@ -16,6 +16,9 @@ from ..store import FORMAT, UNFINISHED
 from .clocks import SensorTimes, sensor_times
 from .writer import FRAME_TIMES, META, write_root
 
+_MAX_DELAY_NS = 2_000_000_000
+"""Delays of frames that differ by more are no delays: one of the clocks was set anew."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Finished:
@@ -100,13 +103,19 @@ def _values(arrays: dict[str, zarr.Array], counts: dict[str, int], name: str) ->
 
 
 def _frame_times(arrays: dict[str, zarr.Array], counts: dict[str, int]) -> SensorTimes:
-    """Times of the frames: by the camera's clock where it has one and its times keep the frames' order, else of arrival."""
+    """Times of the frames: by the camera's clock where it has one that runs evenly, else of arrival."""
     stored, device_ns, arrival_ns = (_values(arrays, counts, name) for name in FRAME_TIMES)
     if np.array_equal(device_ns, arrival_ns):
         return SensorTimes(stored, None, "the camera reports no time of its own: times of arrival are used")
     found = sensor_times(device_ns, arrival_ns)
     if found.audit is not None and np.all(np.diff(found.time_ns) > 0):
         return found
+    delay_ns = arrival_ns - device_ns
+    if len(delay_ns) and np.all(np.diff(device_ns) > 0) and np.ptp(delay_ns) <= _MAX_DELAY_NS:
+        # The host was too busy to know the offset well; its delays would still be worse between one frame and the next.
+        spread_ms = 1e-6 * float(np.ptp(delay_ns))
+        note = f"its clock is taken to differ from the host's by the smallest delay, because delays differ by {spread_ms:.0f} ms"
+        return SensorTimes(device_ns + delay_ns.min(), None, note)
     return SensorTimes(stored, None, found.note or "the camera's times do not increase: times of arrival are used")
 
 

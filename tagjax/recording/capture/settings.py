@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -18,13 +18,14 @@ from .playback_reader import PlaybackReader
 from .r700 import R700Reader, TlsSettings
 from .reader import AbstractReader, ConnectionSettings, InventorySettings
 
+CameraKind: TypeAlias = Literal["playback", "realsense", "orbbec", "k4a"]
+ReaderKind: TypeAlias = Literal["llrp", "r700", "playback"]
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SensorConfig:
-    """Which sensors are used. Raises `ConfigError` for settings that do not fit together."""
+class SensorSettings:
+    """How camera and reader are reached and set."""
 
-    camera: Literal["playback", "realsense", "orbbec", "k4a"] = "playback"
-    reader: Literal["llrp", "r700", "playback"] = "playback"
     recording: str | None = None  # that is played
     address: str | None = None  # of the reader: <host> or <host>:<port>; https://<host> of an R700
     emulate: bool = False  # the reader is an emulated one on loopback, with the reads of `recording`
@@ -34,6 +35,14 @@ class SensorConfig:
     connection: ConnectionSettings = dataclasses.field(default_factory=ConnectionSettings)
     tls: TlsSettings = dataclasses.field(default_factory=TlsSettings)
     emulator: EmulatorSettings = dataclasses.field(default_factory=EmulatorSettings)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SensorConfig(SensorSettings):
+    """Which sensors are used. Raises `ConfigError` for settings that do not fit together."""
+
+    camera: CameraKind = "playback"
+    reader: ReaderKind = "playback"
 
     def __post_init__(self) -> None:
         if ("playback" in (self.camera, self.reader) or self.emulate) and self.recording is None:

@@ -80,8 +80,8 @@ def parsed(parse: Callable[[str], T], text: str, line: int, rejected: Rejected) 
         return parse(text)
     except RowError as error:
         rejected.add(str(error), line)
-    except KeyError:
-        rejected.add("columns are missing", line)
+    except KeyError as error:
+        rejected.add(f"columns are missing: {error.args[0]}", line)
     except PARSING_ERRORS as error:
         rejected.add(f"row cannot be read ({type(error).__name__})", line)
     return None

@@ -33,11 +33,11 @@ def subfolder(base: Path, name: str, key: str) -> Path:
     return base / name
 
 
-def picture_files(folder: Path) -> list[Path]:
-    """The pictures of a folder in natural order of their names. Raises `RecordingError` if there is none."""
-    found = natural_sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES and path.is_file())
+def picture_files(folder: Path, where: str | None = None, endings: Sequence[str] = PICTURES) -> list[Path]:
+    """The pictures of a folder in natural order of their names. Raises `RecordingError`, which begins with `where`, if there is none."""
+    found = natural_sorted(path for path in folder.iterdir() if path.suffix.lower() in endings and path.is_file())
     if not found:
-        raise RecordingError(f"{folder}: no picture; expected files that end in {', '.join(PICTURES)}.")
+        raise RecordingError(f"{where or folder}: no picture; expected files that end in {', '.join(endings)}.")
     return found
 
 
@@ -68,24 +68,32 @@ def timed_files(folder: Path, base: Path, camera: CameraFile) -> list[tuple[int,
     return timed
 
 
-def _times_of_names(folder: Path, unit: str) -> list[tuple[int, Path]]:
-    files = picture_files(folder)
+def times_of_names(files: Sequence[Path], where: str, unit: str = "auto", *, advice: str) -> list[int]:
+    """Nanoseconds of each picture's name in this unit. Raises `RecordingError`, with this advice, for names that are no times."""
     stems = [path.stem for path in files]
     for path in files:
         if not _NUMBER.fullmatch(path.stem):
             raise RecordingError(
-                f"{path}: the name is no time; expected seconds (1700000000.033) or whole milli-, micro- or nanoseconds. "
-                "Set times in the camera file: to a list of times and names, or to frames."
+                f"{where}: {path.name} names no time; expected seconds (1700000000.033) or whole milli-, micro- or nanoseconds. "
+                f"{advice}"
             )
-    if unit == "auto" and len(files) > 1 and all(stem.isdigit() and int(stem) < _MAX_FRAME_NUMBER for stem in stems):
+    if unit == "auto" and all(stem.isdigit() and int(stem) < _MAX_FRAME_NUMBER for stem in stems):
         raise RecordingError(
-            f"{folder}: names such as {stems[0]} and {stems[-1]} look like frame numbers; expected times. Set times in the "
-            "camera file: to a list of times and names, or to frames with fps. If they are times, set time_unit (s, ms, us or ns)."
+            f"{where}: names such as {stems[0]} and {stems[-1]} look like frame numbers; expected times. {advice}"
         )
     try:
-        return [(time_of(stem, unit), path) for stem, path in zip(stems, files, strict=True)]
+        return [time_of(stem, unit) for stem in stems]
     except RowError as error:
-        raise RecordingError(f"{folder}: {error} Set time_unit (s, ms, us or ns) in the camera file.") from error
+        raise RecordingError(f"{where}: the names are no times ({error}). {advice}") from error
+
+
+def _times_of_names(folder: Path, unit: str) -> list[tuple[int, Path]]:
+    files = picture_files(folder)
+    advice = (
+        "Set times in the camera file: to a list of times and names, or to frames with fps. If they are times, set time_unit "
+        "(s, ms, us or ns)."
+    )
+    return list(zip(times_of_names(files, str(folder), unit, advice=advice), files, strict=True))
 
 
 def time_of(text: str, unit: str) -> int:

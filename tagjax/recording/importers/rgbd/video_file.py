@@ -10,14 +10,13 @@ import numpy as np
 
 from ....core.errors import RecordingError
 from ....core.names import valid_name
+from ...video_files import check_whole, frame_time_ns, num_stated_frames, opened_video
 from .camera_file import find_camera_file, read_camera_file
 from .picture_folder import by_time, depth_folder, files_as_pictures
 from .source import Picture, RgbdSource
 from .times import check_counts, picture_files, start_time_ns, timed_files
 
 ENDINGS = (".mp4", ".mov", ".avi", ".m4v")
-
-_MIN_DECODED = 0.98  # of the frames that the container counts; editing may hide some of the first
 
 
 def open_video(path: Path, camera_file: Path | None = None, start: str | float | None = None) -> RgbdSource:
@@ -59,35 +58,25 @@ def open_video(path: Path, camera_file: Path | None = None, start: str | float |
     )
 
 
-def _opened(path: Path) -> cv2.VideoCapture:
-    video = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
-    if not video.isOpened():
-        raise RecordingError(
-            f"{path}: no readable video ({path.stat().st_size} bytes); it is truncated, or its codec is unknown. Copy it again, "
-            "or convert it: ffmpeg -i <video> -c:v libx264 <new>.mp4"
-        )
-    return video
-
-
 def _count(path: Path) -> int:
     """The number of frames that the container states."""
-    video = _opened(path)
+    video = opened_video(path, str(path))
     try:
-        return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        return num_stated_frames(video)
     finally:
         video.release()
 
 
 def _frames(path: Path, num_frames: int, start_ns: int | None) -> Iterator[Picture]:
     """The frames of a video with the container's times, one after the other: each is decoded when it is its turn."""
-    video = _opened(path)
+    video = opened_video(path, str(path))
     number, first_ns = 0, 0
     try:
         while True:
             decoded, image = video.read()
             if not decoded:
                 break
-            time_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            time_ns = frame_time_ns(video)
             if start_ns is not None:
                 first_ns = time_ns if number == 0 else first_ns
                 time_ns += start_ns - first_ns
@@ -95,10 +84,7 @@ def _frames(path: Path, num_frames: int, start_ns: int | None) -> Iterator[Pictu
             number += 1
     finally:
         video.release()
-    if number < _MIN_DECODED * num_frames - 1:
-        raise RecordingError(
-            f"{path}: {number} of {num_frames} frames can be decoded; the video is truncated or damaged. Copy it again."
-        )
+    check_whole(str(path), number, num_frames)
 
 
 def _picture(path: Path, number: int, time_ns: int, image: np.ndarray) -> Picture:
