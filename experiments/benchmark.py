@@ -3,6 +3,7 @@
 python -m experiments.benchmark
 python -m experiments.benchmark tracer                # the tracer, live: frames, parts, start, memory; minutes
 python -m experiments.benchmark tracer tracer.recording=a.zarr tracer.processes=false
+python -m experiments.benchmark memory                # memory of a process over 20,000 live frames; minutes
 python -m experiments.benchmark flow                  # the same as 'cases=[flow]'
 python -m experiments.benchmark training              # a training step against the clip's length; minutes
 python -m experiments.benchmark gather splat repeats=21

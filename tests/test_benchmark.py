@@ -12,9 +12,10 @@ from synthetic_clips import recording
 from experiments import benchmark
 from tagjax.benchmarks.stages import CASES, BenchmarkSettings, run_benchmark
 from tagjax.benchmarks.timing import Figure, Timing
-from tagjax.benchmarks.tracer_speed import TracerSpeedSettings, tracer_figures
+from tagjax.benchmarks.tracer_speed import MemorySettings, TracerSpeedSettings, tracer_figures
+from tagjax.benchmarks.tracer_speed.memory import growth_figures
 from tagjax.benchmarks.tracer_speed.swing import Swing
-from tagjax.core.machine import machine
+from tagjax.core.machine import machine, peak_memory_mib, resident_memory_mib
 from tagjax.core.settings import ConfigError, from_mapping
 
 
@@ -40,7 +41,7 @@ def test_unknown_cases_and_empty_pictures_are_refused():
         from_mapping(BenchmarkSettings, {"cases": ["warp"]})
     with pytest.raises(ValueError, match="at least 32x32"):
         BenchmarkSettings(height=1)
-    assert set(CASES) - set(BenchmarkSettings().cases) == {"training", "tracer"}  # which take minutes
+    assert set(CASES) - set(BenchmarkSettings().cases) == {"training", "tracer", "memory"}  # which take minutes
 
 
 def test_a_swing_has_every_read_of_every_tag_and_no_jump():
@@ -65,6 +66,26 @@ def test_figures_stand_beside_their_aims():
     assert Figure("a", 1.0, "ms").reached is None
     with pytest.raises(ValueError, match="part_frames is 2; expected at least 8"):
         TracerSpeedSettings(part_frames=2)
+    with pytest.raises(ValueError, match="frames is 3000; expected at least 4000"):
+        MemorySettings(frames=3000)
+
+
+def test_growth_of_memory_is_that_of_the_medians():
+    grows = 100.0 + 0.5 * np.arange(40)
+    grows[[3, 35]] += 30.0  # what the allocator has yet to return
+    *after, growth = growth_figures(grows, 500)
+    assert [one.value for one in after] == grows.tolist()
+    assert after[-1].what == "resident memory after 20000 frames"
+    assert growth.value == pytest.approx(1.0, rel=0.05)  # MiB in 1000 frames
+    assert growth.reached is False
+    assert list(growth_figures(np.full(8, 77.0), 1000))[-1].value == 0.0
+
+
+def test_resident_memory_counts_what_is_held():
+    before = resident_memory_mib()
+    held = np.ones(2**24)  # 128 MiB
+    assert resident_memory_mib() - before == pytest.approx(held.nbytes / 2**20, abs=20)
+    assert resident_memory_mib() <= peak_memory_mib()
 
 
 def test_names_of_cases_are_arguments(monkeypatch: pytest.MonkeyPatch):

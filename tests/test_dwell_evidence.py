@@ -249,6 +249,26 @@ def test_slots_without_a_segment_change_nothing(num_existing):
         assert bool(jnp.any(found != every))
 
 
+@pytest.mark.parametrize("num_newborn", [0, 9, 400])
+def test_newborn_segments_of_many_tags_have_the_rows_of_their_sources(num_newborn):
+    num, num_tags, rng = 700, 24, np.random.default_rng(11)
+    state = DwellState.nothing(num_tags, 1, num)
+    names = ("real", "imaginary", "read_m")
+    for name in names:
+        values = jnp.asarray(rng.normal(size=(num_tags, 1, num)), jnp.float32)
+        state = eqx.tree_at(lambda one, name=name: getattr(one, name), state, values)
+    source, rows = np.full(num, -2), np.arange(num)
+    newborn = rng.choice(np.arange(1, num), num_newborn, replace=False)
+    source[newborn] = rng.integers(-1, num, num_newborn)  # some sources are newborn, too
+    rows[newborn] = np.maximum(source[newborn], 0)
+    after, _ = eqx.filter_jit(DwellEvidence().step)(
+        ReaderModel(), state, _arrivals([]), jnp.zeros((1, num)), jnp.ones(num), jnp.asarray(source, jnp.int32),
+        jnp.asarray(1.0), jnp.asarray(1.1),
+    )  # fmt: skip
+    for name in names:
+        np.testing.assert_array_equal(getattr(after, name), np.asarray(getattr(state, name))[..., rows], err_msg=name)
+
+
 def test_evidence_of_two_antennas_adds_up():
     first, second = _still([1.0, 1.02, 0.98]), _still([2.0, 2.02, 1.98, 2.4], antenna=1)
     both = _once(sorted(first + second, key=lambda read: read[2]))[1]

@@ -29,7 +29,7 @@ from ..tracing.range_windows import phase_reads, radio_windows
 from ..tracing.tracer import trace
 from .flow_speed import flow_timings
 from .timing import Figure, Timing, first_call_s, median_ms
-from .tracer_speed import TracerSpeedSettings, tracer_figures
+from .tracer_speed import MemorySettings, TracerSpeedSettings, memory_figures, tracer_figures
 from .training_speed import training_timings
 
 
@@ -43,6 +43,7 @@ class BenchmarkSettings:
     repeats: int = 7
     seed: int = 0
     tracer: TracerSpeedSettings = dataclasses.field(default_factory=TracerSpeedSettings)
+    memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
 
     def __post_init__(self):
         unknown = sorted(set(self.cases) - set(CASES))
@@ -219,6 +220,10 @@ def _tracer(settings: BenchmarkSettings) -> Iterator[Timing | Figure]:
     return tracer_figures(settings.tracer, settings.seed)
 
 
+def _memory(settings: BenchmarkSettings) -> Iterator[Figure]:
+    return memory_figures(settings.memory, settings.seed)
+
+
 CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | Iterable[Timing | Figure]]] = {
     "gather": _gather,
     "splat": _splat,
@@ -231,6 +236,7 @@ CASES: Mapping[str, Callable[[BenchmarkSettings], Timing | Iterable[Timing | Fig
     "flow": _flow,
     "training": _training,
     "tracer": _tracer,
+    "memory": _memory,
 }
 """The cases that can be measured, by name."""
 

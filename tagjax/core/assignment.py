@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy  # `scipy.optimize` is imported at its first use: it takes a quarter of a second
 from jaxtyping import Float, Integer
-from scipy.optimize import linear_sum_assignment
 
 
 def hard_assignment(
@@ -27,7 +27,7 @@ def hard_assignment(
     else:
         allowed &= score > unmatched_score
         value = np.where(allowed, score - unmatched_score, 0.0)
-    rows, columns = linear_sum_assignment(value, maximize=True)
+    rows, columns = scipy.optimize.linear_sum_assignment(value, maximize=True)
     chosen = np.full(score.shape[0], -1)
     chosen[rows] = np.where(allowed[rows, columns], columns, -1)
     return chosen

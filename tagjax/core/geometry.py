@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import scipy  # `scipy.ndimage` is imported at its first use: it takes a quarter of a second
 from jaxtyping import Float, UInt8
-from scipy.ndimage import map_coordinates
 
 from .camera import Intrinsics
 
@@ -116,7 +116,9 @@ def undistort(
     positions = undistorted_positions(intrinsics)
     where = [positions[..., 1], positions[..., 0]]
     # With integer output SciPy truncates, which darkens the image by half a level.
-    channels = [map_coordinates(colour[..., c], where, np.float32, order=1, mode="constant") for c in range(3)]
+    channels = [
+        scipy.ndimage.map_coordinates(colour[..., c], where, np.float32, order=1, mode="constant") for c in range(3)
+    ]
     image = np.clip(np.rint(np.stack(channels, axis=-1)), 0, 255).astype(np.uint8)
-    depth = map_coordinates(depth_m, where, order=0, cval=0)
+    depth = scipy.ndimage.map_coordinates(depth_m, where, order=0, cval=0)
     return image, depth, dataclasses.replace(intrinsics, distortion=())

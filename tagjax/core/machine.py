@@ -36,3 +36,12 @@ def peak_memory_mib() -> float:
 
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def resident_memory_mib() -> float:
+    """The resident memory of this process now. Raises `OSError` where the system has no /proc, as Linux has."""
+    try:
+        pages = Path("/proc/self/statm").read_text().split()[1]
+    except OSError as error:
+        raise OSError(f"found no /proc/self/statm ({error}); expected Linux. Measure the memory there.") from error
+    return int(pages) * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -10,8 +10,8 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+import scipy  # `scipy.optimize` is imported at its first use: it takes a quarter of a second
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 LEVELS = np.arange(0.05, 0.99, 0.05)
 """Overlaps from which a pair counts as a match, over which HOTA is averaged."""
@@ -34,7 +34,7 @@ class MatchFrame:
         """The frame without the true objects `ignored`, and without the detections that match one of them best."""
         ignore = np.isin(self.true_ids, ignored)
         drop = np.zeros(len(self.found_ids), dtype=bool)
-        rows, columns = linear_sum_assignment(-np.where(self.overlap >= MATCH, self.overlap, 0.0))
+        rows, columns = scipy.optimize.linear_sum_assignment(-np.where(self.overlap >= MATCH, self.overlap, 0.0))
         matched = self.overlap[rows, columns] >= MATCH
         drop[columns[matched & ignore[rows]]] = True
         return MatchFrame(self.true_ids[~ignore], self.found_ids[~drop], self.overlap[~ignore][:, ~drop])
@@ -125,7 +125,7 @@ def _hota(rows: Rows, num_true: int, num_found: int) -> tuple[np.ndarray, np.nda
     hits, misses, false = _zeros(), _zeros(), _zeros()
     matches = np.zeros((len(LEVELS), num_true, num_found))
     for true, found, overlap in rows:
-        row, column = linear_sum_assignment(-jaccard[np.ix_(true, found)] * overlap)
+        row, column = scipy.optimize.linear_sum_assignment(-jaccard[np.ix_(true, found)] * overlap)
         matched = overlap[row, column] >= LEVELS[:, None] - _EPSILON
         number = matched.sum(axis=1)
         hits, misses, false = hits + number, misses + len(true) - number, false + len(found) - number
@@ -148,7 +148,7 @@ def _clear(rows: Rows, num_true: int) -> tuple[int, int, int, int]:
             misses, false = misses + len(true), false + len(found)
             continue
         score = np.where(overlap >= MATCH - _EPSILON, overlap + 1000.0 * (found[None] == previous[true][:, None]), 0.0)
-        row, column = linear_sum_assignment(-score)
+        row, column = scipy.optimize.linear_sum_assignment(-score)
         kept = score[row, column] > _EPSILON
         row, column = true[row[kept]], found[column[kept]]
         switches += int(np.sum((last[row] >= 0) & (last[row] != column)))
@@ -168,6 +168,8 @@ def _identity(rows: Rows, num_true: int, num_found: int) -> tuple[int, int, int]
     together = np.zeros((num_true, num_found), dtype=int)
     for true, found, overlap in rows:
         together[np.ix_(true, found)] += overlap >= MATCH - _EPSILON
-    row, column = linear_sum_assignment(-together)  # a pair that never overlaps costs as much as two alone
+    row, column = scipy.optimize.linear_sum_assignment(
+        -together
+    )  # a pair that never overlaps costs as much as two alone
     matches = int(together[row, column].sum())
     return matches, int(true_count.sum()) - matches, int(found_count.sum()) - matches

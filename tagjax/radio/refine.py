@@ -5,7 +5,6 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..core.numerics import SPEED_OF_LIGHT_M_S, wrap_to_pi
@@ -54,6 +53,8 @@ def refine_path(
     read's noise, flattened for outliers; second differences of the knots over the acceleration prior. Solved by
     Levenberg-Marquardt (Optimistix) with implicit gradients; the covariance is the Laplace approximation.
     """
+    import optimistix as optx  # a third of a second, which a live stream does not need
+
     dtype = knot_s.dtype
     weights = interpolation_weights(reads.time_s, knot_s)
     wavenumber = (4 * jnp.pi / SPEED_OF_LIGHT_M_S) * reads.carrier_hz

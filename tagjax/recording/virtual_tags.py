@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
+import scipy  # `scipy.interpolate` is imported at its first use: it takes a third of a second
 
 from ..core.numerics import SPEED_OF_LIGHT_M_S
 from ..radio.reader import (
@@ -65,7 +65,7 @@ class Track:
             t, x = self.time_s[segment], self.position_m[segment]
             velocity = np.gradient(x, t, axis=0)
             inside = (time_s >= t[0]) & (time_s <= t[-1])
-            out[inside] = CubicHermiteSpline(t, x, velocity)(time_s[inside])
+            out[inside] = scipy.interpolate.CubicHermiteSpline(t, x, velocity)(time_s[inside])
         return out
 
 

@@ -29,11 +29,11 @@ _WARM_UP = 5
 masks = jax.jit(dense_masks)
 
 
-def live_tracer(swing: Swing, *, stride: int, flow: str) -> LiveTracer:
-    """A live tracer with a place for each tag."""
+def live_tracer(swing: Swing, *, stride: int, flow: str, tracer: TagAttention | None = None) -> LiveTracer:
+    """A live tracer, the default one if None, with a place for each tag."""
     recording = swing.recording
     return LiveTracer(
-        TagAttention(),
+        TagAttention() if tracer is None else tracer,
         swing.intrinsics,
         recording.antennas_m,
         flow=make_flow(flow),

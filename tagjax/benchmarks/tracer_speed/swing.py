@@ -12,8 +12,6 @@ from ...recording import Intrinsics, Recording, TagReads
 from ...recording.reads import concatenate_reads, join_reads
 from ...recording.store import save_recording
 from ...recording.time_reversal import time_reversed
-from ...sim.record import CaptureSettings, simulate_recording
-from ...sim.stories import build_scenario
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +26,12 @@ class Shot:
 
 def stored_scene(path: Path, *, width: int, num_frames: int, seed: int) -> None:
     """Simulate and store four objects in the hands of two people, with a third person who walks behind them."""
+    from ...sim.record import (  # a live stream, whose start is timed, has no simulator
+        CaptureSettings,
+        simulate_recording,
+    )
+    from ...sim.stories import build_scenario
+
     settings = {"kinds": ["bottle", "toy", "box", "bag"], "num_walkers": 1, "stationary_s": 0.3}
     scenario = build_scenario("handheld", np.random.default_rng(seed), max(1.5, num_frames / 30 + 0.2), settings)
     capture = CaptureSettings(width=width, shadows=False)

@@ -20,12 +20,14 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from ...core.constrained import Positive
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
-from .cells import row_sources
+from .cells import NOT_NEW, row_sources
 from .labels import STATIC
 
 _SHORTEST_FRAME_S = 1e-6
 _CHUNK = 8  # reads: valid ones come first in a frame's buffer, which is mostly empty
-_FEW = 512  # segments: hardly ever more exist, after the first seconds
+_BLOCK = 512  # slots that exist: reads are worked in for so many at a time
+_FEW = 256  # newborn segments: more only in the first frame, hardly ever later
+_FEW_ROWS = 16  # tags times antennas, of which all slots are as soon copied
 
 _Rows = tuple[Array, Array, Array]
 ReadsT = TypeVar("ReadsT", bound=tuple[Any, ...])
@@ -90,105 +92,74 @@ class DwellEvidence(eqx.Module):
         may be left out of the reads, because nothing but a newborn segment will be there; with `exists` None, or nowhere,
         all take part.
         """
-        source = row_sources(newborn_source)
         increment_m = increment_m.at[:, STATIC].set(0.0)
-        last_m = _taken(state.distance_m, source)
-        memory_s = self.memory_s.value
-        decay = jnp.exp(-(now_s - since_s) / memory_s)
-        fraction = jnp.clip((arrivals.time_s - since_s) / jnp.maximum(now_s - since_s, _SHORTEST_FRAME_S), 0.0, 1.0)
-        fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / memory_s)
-
-        num_antennas, shape = increment_m.shape[0], state.real.shape
-        reads = in_chunks((arrivals, fraction, fresh))
+        span_s = jnp.maximum(now_s - since_s, _SHORTEST_FRAME_S)
+        fraction = jnp.clip((arrivals.time_s - since_s) / span_s, 0.0, 1.0)
+        fresh = jnp.exp(-jnp.maximum(now_s - arrivals.time_s, 0.0) / self.memory_s.value)
+        shape, last_m = state.real.shape, _taken(state.distance_m, row_sources(newborn_source))
         tables = tuple(table.reshape(-1, shape[-1]) for table in (state.real, state.imaginary, state.read_m))
-        of_tags = tables, decay * state.log_likelihood
-
-        def scanned(
-            of_tags: tuple[_Rows, Array], last_m: Array, increment_m: Array, depth_m: Array
-        ) -> tuple[_Rows, Array, Array]:
-            """The tables and the evidence (some or all columns) after the reads, and the channels of the dwells."""
-            tables, log_likelihood = of_tags
-            speed_m_s = increment_m / jnp.maximum(now_s - since_s, _SHORTEST_FRAME_S)
-
-            def updated(rows: _Rows, read: Arrivals, part: Array, goes_on: Array) -> tuple[Array, _Rows]:
-                """The evidence of a read for every segment, and the rows of its tag and antenna after it."""
-                distance_m = last_m[read.antenna] + part * increment_m[read.antenna]
-                real, imaginary = (jnp.where(goes_on, row, 0.0) for row in rows[:2])
-                moved_m = jnp.where(goes_on, distance_m - rows[2], 0.0)
-                real, imaginary = reader.moved(real, imaginary, moved_m, depth_m, read.carrier_hz)
-                concentration = reader.concentration(read.rssi_dbm, speed_m_s[read.antenna])
-                evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
-                return evidence, (real, imaginary, distance_m)
-
-            def add(carry: tuple[_Rows, Array, Array], one: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
-                tables, log_likelihood, channel = carry
-                read, part, weight = one
-                at = read.tag * num_antennas + read.antenna
-                rows = tuple(jax.lax.dynamic_index_in_dim(table, at, keepdims=False) for table in tables)
-                # Padding costs nothing. What a read computes is computed again for gradients: kept, it takes 18 MB a frame.
-                evidence, rows = jax.lax.cond(
-                    read.valid,
-                    jax.checkpoint(updated, prevent_cse=False),
-                    lambda rows, *_: (jnp.zeros_like(rows[0]), rows),
-                    rows,
-                    read,
-                    part,
-                    read.channel == channel[at],
-                )
-                own = jax.lax.dynamic_index_in_dim(log_likelihood, read.tag, keepdims=False) + weight * evidence
-                changed = zip(tables, rows, strict=True)
-                return (
-                    tuple(jax.lax.dynamic_update_index_in_dim(table, row, at, 0) for table, row in changed),
-                    jax.lax.dynamic_update_index_in_dim(log_likelihood, own, read.tag, 0),
-                    channel.at[at].set(jnp.where(read.valid, read.channel, channel[at])),
-                ), None
-
-            def add_chunk(carry: Any, chunk: tuple[Arrivals, Array, Array]) -> tuple[Any, None]:
-                some = jnp.any(chunk[0].valid)
-                return jax.lax.cond(some, lambda: jax.lax.scan(add, carry, chunk)[0], lambda: carry), None
-
-            begin = tables, log_likelihood, state.channel.reshape(-1)
-            return jax.lax.scan(add_chunk, begin, reads)[0]
-
-        def of_all() -> tuple[_Rows, Array, Array]:
-            tables, before = jax.tree.map(lambda rows: _taken(rows, source), of_tags)
-            return scanned((tables, inherited(before, newborn_source)), last_m, increment_m, depth_m)
-
-        def of_those(exists: Bool[Array, " segment"]) -> tuple[_Rows, Array, Array]:
-            (slots,) = jnp.nonzero(exists, size=_FEW, fill_value=shape[-1])
-            tables, before = jax.tree.map(lambda rows: _taken(rows, _taken(source, slots)), of_tags)
-            before = inherited(before, _taken(newborn_source, slots), slots)
-            columns = (_taken(rows, slots) for rows in (last_m, increment_m, depth_m))
-            *changed, channel = scanned((tables, before), *columns)
-            put = lambda rows, own: rows.at[:, slots].set(own, mode="drop", indices_are_sorted=True)  # noqa: E731
-            return (*jax.tree.map(put, of_tags, tuple(changed)), channel)
-
-        if exists is None or shape[-1] <= _FEW:
-            tables, log_likelihood, channel = of_all()
-        else:
-            some, exists = jnp.any(exists), exists.at[STATIC].set(True)
-            few = some & (jnp.sum(exists, dtype=jnp.int32) <= _FEW)
-            tables, log_likelihood, channel = jax.lax.cond(few, lambda: of_those(exists), of_all)
+        begin = (*_of_sources(tables, newborn_source), self._begun(state, newborn_source, since_s, now_s))
+        goes_on, channel = _in_dwells(arrivals, state.channel)
+        reads = in_chunks((arrivals, goes_on, fraction, fresh))
+        motion = last_m, increment_m, increment_m / span_s, depth_m
+        *tables, log_likelihood = _after_reads(reader, begin, reads, motion, exists)
         real, imaginary, read_m = (table.reshape(shape) for table in tables)
-        distance_m = last_m + increment_m
-        after = DwellState(real, imaginary, read_m, distance_m, channel.reshape(shape[:2]), log_likelihood)
+        after = DwellState(real, imaginary, read_m, last_m + increment_m, channel, log_likelihood)
         return after, log_likelihood
+
+    def _begun(
+        self,
+        state: DwellState,
+        newborn_source: Int[Array, " segment"],
+        since_s: Float[Array, ""],
+        now_s: Float[Array, ""],
+    ) -> Float[Array, "tag segment"]:
+        """The evidence with which the frame at `now_s` begins: that of the last one, `inherited`, as far as it lasts."""
+        decay = jnp.exp(-(now_s - since_s) / self.memory_s.value)
+        return inherited(decay * _taken(state.log_likelihood, row_sources(newborn_source)), newborn_source)
 
 
 def inherited(
-    log_likelihood: Float[Array, "tag some"],
-    newborn_source: Int[Array, " some"],
-    slots: Int[Array, " some"] | None = None,
-) -> Float[Array, "tag some"]:
+    log_likelihood: Float[Array, "tag segment"], newborn_source: Int[Array, " segment"]
+) -> Float[Array, "tag segment"]:
     """The evidence with which a frame begins, of that of each segment's source.
 
     A segment from slot 0 or from nowhere was at rest there, or it comes into view: through a door, from behind something.
     What it did before is then unknown, so reads of that time say nothing against it. Evidence for a tag at rest is kept.
-    `slots` are the segments, all if None.
     """
-    slots = jnp.arange(newborn_source.shape[0]) if slots is None else slots
-    unknown = (newborn_source > -2) & (newborn_source <= STATIC) & (slots != STATIC)
+    unknown = (newborn_source > NOT_NEW) & (newborn_source <= STATIC) & (jnp.arange(len(newborn_source)) != STATIC)
     return jnp.where(unknown[None], jnp.maximum(log_likelihood, 0.0), log_likelihood)
+
+
+def _of_sources(tables: _Rows, newborn_source: Int[Array, " segment"]) -> _Rows:
+    """The rows with those of each newborn segment's source, which costs little where few are newborn."""
+    num, source = newborn_source.shape[0], row_sources(newborn_source)
+    newborn = source != jnp.arange(num, dtype=source.dtype)
+
+    def of_few() -> _Rows:
+        (slots,) = jnp.nonzero(newborn, size=_FEW, fill_value=num)
+        return jax.tree.map(lambda rows: _put(rows, slots, _taken(rows, _taken(source, slots))), tables)
+
+    def of_all() -> _Rows:
+        return jax.tree.map(lambda rows: _taken(rows, source), tables)
+
+    if num <= _FEW or len(tables[0]) <= _FEW_ROWS:
+        return of_all()
+    return jax.lax.cond(jnp.sum(newborn, dtype=jnp.int32) <= _FEW, of_few, of_all)
+
+
+def _in_dwells(
+    arrivals: Arrivals, channel: Int[Array, "tag antenna"]
+) -> tuple[Bool[Array, " reads"], Int[Array, "tag antenna"]]:
+    """Which reads go on with a dwell that had reads before, and the channels of the dwells after all reads."""
+    row, order = arrivals.tag * channel.shape[1] + arrivals.antenna, jnp.arange(len(arrivals.tag), dtype=jnp.int32)
+    before = (row[:, None] == row[None]) & (order[:, None] > order[None]) & arrivals.valid[None]
+    of_row = (row[None] == jnp.arange(channel.size, dtype=row.dtype)[:, None]) & arrivals.valid[None]
+    last, last_of_row = (jnp.max(jnp.where(reads, order[None], -1), axis=1) for reads in (before, of_row))
+    flat = channel.reshape(-1)
+    then = jnp.where(last >= 0, arrivals.channel[last], flat[row])
+    after = jnp.where(last_of_row >= 0, arrivals.channel[last_of_row], flat)
+    return arrivals.channel == then, after.reshape(channel.shape)
 
 
 def in_chunks(reads: ReadsT) -> ReadsT:
@@ -197,5 +168,82 @@ def in_chunks(reads: ReadsT) -> ReadsT:
     return jax.tree.map(lambda leaf: jnp.pad(leaf, (0, more)).reshape(-1, _CHUNK), reads)
 
 
+def _after_reads(
+    reader: ReaderModel,
+    rows: tuple[Array, Array, Array, Array],
+    reads: tuple[Arrivals, Array, Array, Array],
+    motion: tuple[Array, Array, Array, Array],
+    exists: Bool[Array, " segment"] | None,
+) -> tuple[Array, Array, Array, Array]:
+    """The rows of phasors, distances and evidence after the reads, for the slots that exist, a block of them at a time."""
+    num = rows[0].shape[-1]
+    size = min(num, _BLOCK)
+    exists = jnp.ones(num, bool) if exists is None else exists
+    exists = jnp.where(jnp.any(exists), exists.at[STATIC].set(True), True)
+    (slots,) = jnp.nonzero(exists, size=-(-num // size) * size, fill_value=num)
+
+    def of_block(rows: Any, slots: Int[Array, " some"]) -> tuple[Any, None]:
+        return jax.lax.cond(
+            slots[0] < num, lambda: _block_after_reads(reader, rows, reads, motion, slots), lambda: rows
+        ), None
+
+    return jax.lax.scan(of_block, rows, slots.reshape(-1, size))[0]
+
+
+def _block_after_reads(
+    reader: ReaderModel,
+    rows: tuple[Array, Array, Array, Array],
+    reads: tuple[Arrivals, Array, Array, Array],
+    motion: tuple[Array, Array, Array, Array],
+    slots: Int[Array, " some"],
+) -> tuple[Array, Array, Array, Array]:
+    """The same for the given slots."""
+    last_m, increment_m, speed_m_s, depth_m = (_taken(values, slots) for values in motion)
+
+    def updated(own: _Rows, read: Arrivals, part: Array, goes_on: Array) -> tuple[Array, _Rows]:
+        """The evidence of a read for every slot, and the rows of its tag and antenna after it."""
+        distance_m = last_m[read.antenna] + part * increment_m[read.antenna]
+        real, imaginary = (jnp.where(goes_on, row, 0.0) for row in own[:2])
+        moved_m = jnp.where(goes_on, distance_m - own[2], 0.0)
+        real, imaginary = reader.moved(real, imaginary, moved_m, depth_m, read.carrier_hz)
+        concentration = reader.concentration(read.rssi_dbm, speed_m_s[read.antenna])
+        evidence, real, imaginary = reader.add_read(real, imaginary, concentration, read.phase_rad)
+        return evidence, (real, imaginary, distance_m)
+
+    def add(rows: Any, one: tuple[Arrivals, Array, Array, Array]) -> tuple[Any, None]:
+        *tables, log_likelihood = rows
+        read, goes_on, part, weight = one
+        at = read.tag * last_m.shape[0] + read.antenna
+        own = tuple(_taken(table[at], slots) for table in tables)
+        # Padding costs nothing. What a read computes is computed again for gradients: kept, it takes 18 MB a frame.
+        evidence, own = jax.lax.cond(
+            read.valid,
+            jax.checkpoint(updated, prevent_cse=False),
+            lambda own, *_: (jnp.zeros_like(own[0]), own),
+            own, read, part, goes_on,
+        )  # fmt: skip
+        of_tag = _taken(log_likelihood[read.tag], slots) + weight * evidence
+        put = [_put_row(table, at, slots, row) for table, row in zip(tables, own, strict=True)]
+        return (*put, _put_row(log_likelihood, read.tag, slots, of_tag)), None
+
+    def add_chunk(rows: Any, chunk: tuple[Arrivals, Array, Array, Array]) -> tuple[Any, None]:
+        return jax.lax.cond(jnp.any(chunk[0].valid), lambda: jax.lax.scan(add, rows, chunk)[0], lambda: rows), None
+
+    return jax.lax.scan(add_chunk, rows, reads)[0]
+
+
 def _taken(rows: Shaped[Array, "*batch segment"], slots: Int[Array, " some"]) -> Shaped[Array, "*batch some"]:
     return jnp.take(rows, slots, axis=-1, mode="clip")
+
+
+def _put(
+    rows: Shaped[Array, "row segment"], slots: Int[Array, " some"], own: Shaped[Array, "row some"]
+) -> Shaped[Array, "row segment"]:
+    """The rows with others at these slots, which are in order; there may be too many."""
+    return rows.at[:, slots].set(own, mode="drop", indices_are_sorted=True)
+
+
+def _put_row(
+    rows: Shaped[Array, "row segment"], at: Int[Array, ""], slots: Int[Array, " some"], own: Shaped[Array, " some"]
+) -> Shaped[Array, "row segment"]:
+    return rows.at[at, slots].set(own, mode="drop", indices_are_sorted=True)
