@@ -74,11 +74,11 @@ class Detection(eqx.Module):
         stationary: float = 0.5,
         free: float = 0.65,
         free_recent: float = 1.0,
-        level: float = 0.3,
+        level: float = 0.4,
         moves_nats: float = 2.0,
         moves_level: float = 1.3,
         fresh_s: float = 0.7,
-        threshold: float = 0.4,
+        threshold: float = 0.5,
     ) -> None:
         """Raises `ValueError` for a time or temperature that is not positive, or a threshold that is not between 0 and 1."""
         self.temperature_nats, self.moves_nats = Positive(temperature_nats), Positive(moves_nats)
