@@ -53,7 +53,8 @@ def test_the_confidence_is_what_the_body_explains_better_than_its_rivals():
     number, free_nats = np.array([3.0, 50.0, 20.0]), np.array([5.0, -1.0, 3.0])
     found = detection.confidence(evidence(body, still, free), recent(number, free_nats))
     better = body - 0.25 * np.minimum(still, 0) - 0.75 * free - 2 * np.maximum(free_nats, 0)
-    expected = expit((body - still) / 3 - 0.5) * expit(better / 5 - 1) * (1 - np.exp(-number))
+    moves = np.maximum(body, free) - np.maximum(still, 0)
+    expected = expit(moves / 3 - 0.5) * expit(better / 5 - 1) * (1 - np.exp(-number))
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 

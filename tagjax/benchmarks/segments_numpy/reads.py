@@ -215,7 +215,8 @@ class Confidence:
     def of(self, body_nats: np.ndarray, stationary_nats: np.ndarray, free_nats: np.ndarray) -> np.ndarray:
         """The confidence of each tag, from the evidence (tag) for each explanation of its reads."""
         one = self.settings
-        moves = (body_nats - stationary_nats) / np.float32(one.moves_nats.value) - float(one.moves_level)
+        some_path, none = np.maximum(body_nats, free_nats), np.maximum(stationary_nats, 0)
+        moves = (some_path - none) / np.float32(one.moves_nats.value) - float(one.moves_level)
         better = body_nats - float(one.stationary) * np.minimum(stationary_nats, 0)
         free, free_recent = np.maximum(free_nats, 0), np.maximum(self.recent_free_nats, 0)
         better -= float(one.free) * free + float(one.free_recent) * free_recent

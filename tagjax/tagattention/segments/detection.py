@@ -5,10 +5,10 @@ its body (E_b), it is stationary (E_s), or it moves on a smooth path of its own 
 segments explains any reads fairly well. So the body counts by what it explains better than the others do:
 
     confidence = p_moves p_body (1 - exp(-n))
-    p_moves = sigmoid((E_b - E_s) / T_m - c_m)
+    p_moves = sigmoid((max(E_b, E_f) - max(E_s, 0)) / T_m - c_m)
     p_body = sigmoid((E_b - w_s min(E_s, 0) - w_f max(E_f, 0) - w_r max(R_f, 0)) / T - c) .
 
-A tag that surely moves (E_s < 0) needs less evidence for its body. R_f is the part of E_f from recent reads, and n is their number: each counts as exp(-age / fresh_s). What was read seconds ago
+So p_moves asks whether the tag moves on any path, and p_body whether on this one. A tag that surely moves (E_s < 0) needs less evidence for its body. R_f is the part of E_f from recent reads, and n is their number: each counts as exp(-age / fresh_s). What was read seconds ago
 says little of where the tag is now; at least one read is recent with probability 1 - exp(-n). The weights are learned
 without labels: the confidence should be 1 where the mask is the smoother's, and 0 where it is not, and for reads that belong
 to nothing in view, which are taken to be one tenth of all.
@@ -74,11 +74,11 @@ class Detection(eqx.Module):
         stationary: float = 0.5,
         free: float = 0.65,
         free_recent: float = 1.0,
-        level: float = 0.4,
+        level: float = 0.3,
         moves_nats: float = 2.0,
         moves_level: float = 1.3,
         fresh_s: float = 0.7,
-        threshold: float = 0.5,
+        threshold: float = 0.4,
     ) -> None:
         """Raises `ValueError` for a time or temperature that is not positive, or a threshold that is not between 0 and 1."""
         self.temperature_nats, self.moves_nats = Positive(temperature_nats), Positive(moves_nats)
@@ -110,7 +110,8 @@ class Detection(eqx.Module):
 
     def confidence(self, nats: Explanations, recent: RecentReads) -> Float[Array, " tag"]:
         """The confidence of each tag, 0 to 1, from the evidence and the recent reads."""
-        moves = (nats.body - nats.stationary) / self.moves_nats.value - self.moves_level
+        some_path, none = jnp.maximum(nats.body, nats.free), jnp.maximum(nats.stationary, 0.0)
+        moves = (some_path - none) / self.moves_nats.value - self.moves_level
         free, free_recent = jnp.maximum(nats.free, 0.0), jnp.maximum(recent.free_nats, 0.0)
         rivals = self.stationary * jnp.minimum(nats.stationary, 0.0) + self.free * free + self.free_recent * free_recent
         better = (nats.body - rivals) / self.temperature_nats.value - self.level
