@@ -26,7 +26,7 @@ from tagjax.training.hindsight.control import control_of, control_reads
 from tagjax.training.hindsight.objective import control_sums, hindsight_sums
 from tagjax.training.hindsight.pieces import frame_of
 
-SETTINGS = HindsightSettings(memory=1.0)
+SETTINGS = HindsightSettings(memory=1.0, controls=0.25)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_the_loss_of_a_control_is_the_mean_square_of_its_confidence(piece: Piece
     with_control, logged = terms(TRACER, piece.camera, piece.frames)
     without, fewer = terms(TRACER, piece.camera, dataclasses.replace(piece.frames, control=None))
     more = with_control["hindsight"] - without["hindsight"]
-    np.testing.assert_allclose(more, np.mean(confidence**2), rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(more, np.mean(confidence**2) / 3, rtol=1e-3, atol=1e-6)  # 1 of 4 to 3 of 4
     np.testing.assert_allclose(logged["false_confidence/control"], np.mean(confidence), rtol=1e-4)
     assert set(fewer) == {"overlap", "false_confidence"}
 
@@ -170,10 +170,10 @@ def test_files_hold_the_controls_and_are_the_same_each_time(piece: Piece, tmp_pa
     ("given", "message"),
     [
         ({"hindsight": {"stages": "body"}}, r"hindsight\.stages: found 'body'; expected one of 'all', 'detection'"),
-        ({"hindsight": {"controls": "foreign"}}, r"hindsight\.controls: found 'foreign'; expected true or false"),
+        ({"hindsight": {"controls": 1.0}}, r"hindsight: controls is 1\.0; expected a fraction from 0 to 1, 1 excluded"),
         (
             {"data": {"control": "shifted"}},
-            r"data\.control is shifted and hindsight\.controls is true; expected one of them",
+            r"data\.control is shifted and hindsight\.controls is 0\.1; expected one of them",
         ),
     ],
 )
@@ -183,6 +183,6 @@ def test_settings_that_cannot_be_used_are_refused(given: dict[str, Any], message
 
 
 def test_a_run_on_controls_has_none_of_its_own() -> None:
-    given = {"data": {"control": "foreign"}, "hindsight": {"controls": False}}
+    given = {"data": {"control": "foreign"}, "hindsight": {"controls": 0.0}}
     config = from_mapping(TrainConfig, {**LEAST, **given})
-    assert config.hindsight == HindsightSettings(controls=False)
+    assert config.hindsight == HindsightSettings(controls=0.0)

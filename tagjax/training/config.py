@@ -51,8 +51,8 @@ class TrainConfig:
             )
         if self.data.control is not None and isinstance(self.learned, HindsightSettings) and self.learned.controls:
             raise ConfigError(
-                f"data.control is {self.data.control} and hindsight.controls is true; expected one of them: reads that are "
-                "exchanged twice may belong to what is seen. Set hindsight.controls=false."
+                f"data.control is {self.data.control} and hindsight.controls is {self.learned.controls}; expected one of them: "
+                "reads that are exchanged twice may belong to what is seen. Set hindsight.controls=0."
             )
 
     @property

@@ -35,8 +35,8 @@ class HindsightSettings:
     clip_norm: float = 0.3  # of a piece's gradient, at most: some have 50 times the median
     piece_frames: int = 256  # a recording is cut into pieces of at most so many frames
     teacher: Teacher = "smoother"  # or labels: the true masks of simulated recordings, to compare with
-    controls: bool = True  # each piece also with reads that belong to nothing in view: what is detected then is false
-    stages: Literal["all", "detection"] = "all"  # that learn; detection alone takes a fourth of the time
+    controls: float = 0.1  # fraction of reads taken to belong to nothing in view, which teach what is false; 0: none
+    stages: Literal["all", "detection"] = "all"  # that learn; detection alone needs no backward pass through the others
     term_norms: ClassVar[bool] = False  # there is one term
 
     def __post_init__(self) -> None:
@@ -48,6 +48,8 @@ class HindsightSettings:
             raise ConfigError(f"clip_norm is {self.clip_norm}; expected a positive norm.")
         if self.piece_frames < 1:
             raise ConfigError(f"piece_frames is {self.piece_frames}; expected at least 1 frame.")
+        if not 0 <= self.controls < 1:
+            raise ConfigError(f"controls is {self.controls}; expected a fraction from 0 to 1, 1 excluded.")
 
     def weights(self) -> dict[str, float]:
         """The weight of each term."""
@@ -71,7 +73,7 @@ class HindsightSettings:
         }
         if frames.control is not None:
             strange = control_sums(tracer, camera, frames, self)
-            loss = loss + safe_divide(strange.wrong, strange.num)
+            loss = loss + self.controls / (1.0 - self.controls) * safe_divide(strange.wrong, strange.num)
             logged["false_confidence/control"] = safe_divide(strange.claimed, strange.num)
         return {"hindsight": loss}, logged
 
