@@ -22,12 +22,18 @@ from ...recording import Recording
 from ...tagattention.segments import SegmentFrame, TagAttention
 from ...tracing.clips import selected_tags
 from ...tracing.tracer import Camera
+from .control import ControlReads, control_of
 from .objective import HindsightSettings
 from .pieces import Piece, PieceFrames, segment_pieces
 from .teachers import Teacher
 
 _INDEX = "index.json"
-_NESTED: Mapping[str, type] = {"found": SegmentFrame, "arrivals": Arrivals, "radio": RadioWindow}
+_NESTED: Mapping[str, type] = {
+    "found": SegmentFrame,
+    "arrivals": Arrivals,
+    "radio": RadioWindow,
+    "control": ControlReads,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,18 +51,22 @@ class PieceFiles:
         epcs: Sequence[str] | None,
         num_frames: int,
         teacher: Teacher = "smoother",
+        controls: bool = False,
         on_progress: OnProgress = unobserved,
     ) -> PieceFiles:
         """The folder with the pieces of all recordings; those that it holds already are not computed again.
 
-        `on_progress` counts the recordings.
+        With `controls` each piece has control reads (`control_of`). `on_progress` counts the recordings.
         """
         make_folder(self.folder)
         stage = f"{self.folder.name} recordings: segments and masks"
         for recording in recordings[len(self._index()) :]:
             tags, names, index = selected_tags(recording, epcs), [], self._index()
             on_progress(stage, len(index), len(recordings), recording.name)
-            for piece in segment_pieces(recording, tracer, load, epcs=tags, num_frames=num_frames, teacher=teacher):
+            control = control_of(recordings, len(index)) if controls else None
+            for piece in segment_pieces(
+                recording, tracer, load, epcs=tags, num_frames=num_frames, teacher=teacher, control=control
+            ):
                 names.append(f"{len(index):04d}-{len(names):03d}.safetensors")
                 _write(self.folder / names[-1], piece)
             write_json(self.folder / _INDEX, [*index, names])
@@ -105,10 +115,12 @@ def _read(path: Path) -> Piece:
 
 
 def _built(kind: type, leaves: Mapping[str, Any], before: str = "") -> Any:
-    names = [field.name for field in dataclasses.fields(kind)]
-    return kind(
-        **{
-            name: _built(_NESTED[name], leaves, f"{name}.") if name in _NESTED else leaves[before + name]
-            for name in names
-        }
-    )
+    """The module of this kind whose leaves have names that begin with `before`; None where there is none."""
+    if not any(name.startswith(before) for name in leaves):
+        return None
+    names = [before + field.name for field in dataclasses.fields(kind)]
+    built = [
+        leaves[name] if name in leaves else _built(_NESTED[name.rpartition(".")[2]], leaves, f"{name}.")
+        for name in names
+    ]
+    return kind(*built)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,6 +35,8 @@ class HindsightSettings:
     clip_norm: float = 0.3  # of a piece's gradient, at most: some have 50 times the median
     piece_frames: int = 256  # a recording is cut into pieces of at most so many frames
     teacher: Teacher = "smoother"  # or labels: the true masks of simulated recordings, to compare with
+    controls: float = 0.1  # fraction of reads taken to belong to nothing in view, which teach what is false; 0: none
+    stages: Literal["all", "detection"] = "all"  # that learn; detection alone needs no backward pass through the others
     term_norms: ClassVar[bool] = False  # there is one term
 
     def __post_init__(self) -> None:
@@ -45,6 +48,8 @@ class HindsightSettings:
             raise ConfigError(f"clip_norm is {self.clip_norm}; expected a positive norm.")
         if self.piece_frames < 1:
             raise ConfigError(f"piece_frames is {self.piece_frames}; expected at least 1 frame.")
+        if not 0 <= self.controls < 1:
+            raise ConfigError(f"controls is {self.controls}; expected a fraction from 0 to 1, 1 excluded.")
 
     def weights(self) -> dict[str, float]:
         """The weight of each term."""
@@ -62,10 +67,15 @@ class HindsightSettings:
         assert isinstance(tracer, TagAttention)
         sums = hindsight_sums(tracer, camera, frames, self)
         loss = safe_divide(sums.missed, sums.num_there) + safe_divide(sums.wrong, sums.num_there + sums.num_away)
-        return {"hindsight": loss}, {
+        logged = {
             "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
             "false_confidence": safe_divide(sums.claimed, sums.num_away),
         }
+        if frames.control is not None:
+            strange = control_sums(tracer, camera, frames, self)
+            loss = loss + self.controls / (1.0 - self.controls) * safe_divide(strange.wrong, strange.num)
+            logged["false_confidence/control"] = safe_divide(strange.claimed, strange.num)
+        return {"hindsight": loss}, logged
 
 
 class HindsightSums(NamedTuple):
@@ -76,6 +86,14 @@ class HindsightSums(NamedTuple):
     claimed: Float[Array, ""]  # confidence where it sees nothing
     num_there: Float[Array, ""]
     num_away: Float[Array, ""]
+
+
+class ControlSums(NamedTuple):
+    """Sums over the tag-frames of a control, in all of which the confidence should be 0, and their number."""
+
+    wrong: Float[Array, ""]  # confidence^2
+    claimed: Float[Array, ""]  # confidence
+    num: Float[Array, ""]
 
 
 class _Apart(eqx.Module):
@@ -103,21 +121,13 @@ def hindsight_sums(
     proper score; Brier, 1950). That carries no gradient to the mask, nor does what detection is given: so the mask teaches
     every stage but detection, and the confidence teaches detection alone.
     """
-    tracer = eqx.tree_at(lambda one: one.detection, tracer, replace_fn=_Apart)
-    num_antennas, num_tags = camera.antennas_m.shape[0], frames.present.shape[1]
-    window = frames.radio.relative_m.shape[-1]
-
-    def step(state: Any, frame: PieceFrames) -> tuple[Any, tuple[Array, Array, Array]]:
-        state = faded(state, settings.memory)
-        state, out = tracer.associate(camera, state, frame.found, frame_of(frame, num_antennas))
-        area = frame.found.area
-        both = out.membership * frame.target
-        overlap = safe_divide(both @ area, (out.membership + frame.target - both) @ area)
-        return state, (overlap, out.confidence, frame.target @ area)
-
-    state = tracer.no_reads(num_tags, num_antennas, window, frames.time_s[0])
-    # In a scan nothing can be merged across the forward and the backward pass.
-    _, (overlap, confidence, size) = jax.lax.scan(jax.checkpoint(step, prevent_cse=False), state, frames)
+    if settings.stages == "detection":
+        overlap, confidence, size = _of_detection(tracer, camera, frames, settings.memory)
+    else:
+        apart = eqx.tree_at(lambda one: one.detection, tracer, replace_fn=_Apart)
+        overlap, confidence, size = _scanned(
+            apart, camera, frames, lambda state: faded(state, settings.memory), jax.checkpoint
+        )
     there = frames.present & (frames.confidence > settings.sure) & (size > 0)
     away = frames.present & (frames.confidence < 1.0 - settings.sure)
     right = jnp.where(there & (overlap > _RIGHT), 1.0, 0.0)
@@ -130,3 +140,49 @@ def hindsight_sums(
         num_there=jnp.sum(there.astype(wrong.dtype)),
         num_away=jnp.sum(away.astype(wrong.dtype)),
     )
+
+
+def control_sums(tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings) -> ControlSums:
+    """How sure the tracer is of tags whose reads belong to nothing in view. Detection alone learns from it."""
+    frames = frames.of_control()
+    _, confidence, _ = _of_detection(tracer, camera, frames, settings.memory)
+    claimed = jnp.where(frames.present, confidence, 0.0)
+    return ControlSums(jnp.sum(claimed**2), jnp.sum(claimed), jnp.sum(frames.present.astype(claimed.dtype)))
+
+
+def _of_detection(
+    tracer: TagAttention, camera: Camera, frames: PieceFrames, memory: float
+) -> tuple[Array, Array, Array]:
+    """`_scanned` with gradients of detection only: the backward pass goes through its recent reads, and traces nothing again."""
+    given, detection = jax.lax.stop_gradient(tracer), _Apart(tracer.detection)
+    tracer = eqx.tree_at(lambda one: one.detection, given, detection)
+
+    def before(state: Any) -> Any:
+        recent = faded(state.recent, memory)
+        return eqx.tree_at(lambda one: one.recent, jax.lax.stop_gradient(state), recent)
+
+    return _scanned(tracer, camera, frames, before, lambda step, **_: step)
+
+
+def _scanned(
+    tracer: TagAttention,
+    camera: Camera,
+    frames: PieceFrames,
+    before: Callable[[Any], Any],
+    wrapped: Callable[..., Callable[..., Any]],
+) -> tuple[Float[Array, "time tag"], Float[Array, "time tag"], Float[Array, "time tag"]]:
+    """Soft IoU with the target, confidence, and the target's area, pixels. `before` is done to the state at each frame."""
+    frames = dataclasses.replace(frames, control=None)
+
+    def step(state: Any, frame: PieceFrames) -> tuple[Any, tuple[Array, Array, Array]]:
+        seen = frame_of(frame, camera.antennas_m.shape[0])
+        state, out = tracer.associate(camera, before(state), frame.found, seen)
+        area = frame.found.area
+        both = out.membership * frame.target
+        overlap = safe_divide(both @ area, (out.membership + frame.target - both) @ area)
+        return state, (overlap, out.confidence, frame.target @ area)
+
+    num_antennas, num_tags = camera.antennas_m.shape[0], frames.present.shape[1]
+    begin = tracer.no_reads(num_tags, num_antennas, frames.radio.relative_m.shape[-1], frames.time_s[0])
+    # In a scan nothing can be merged across the forward and the backward pass.
+    return jax.lax.scan(wrapped(step, prevent_cse=False), begin, frames)[1]

@@ -14,12 +14,13 @@ from jaxtyping import Array, Bool, Float
 
 from ...radio.arrivals import Arrivals
 from ...radio.reads import RadioWindow
-from ...recording import Recording
+from ...recording import Recording, TagReads
 from ...tagattention.segments import SegmentFrame, TagAttention
 from ...tagattention.segments.outline import filled_labels
 from ...tagattention.segments.state import last_s
 from ...tracing.recordings import TraceSettings, run_tracer
 from ...tracing.tracer import Camera, Frame
+from .control import ControlReads, control_reads
 from .teachers import Teacher, smoother_masks, true_masks
 
 _FRAMES = 32
@@ -37,6 +38,22 @@ class PieceFrames(eqx.Module):
     present: Bool[Array, "time tag"]
     target: Float[Array, "time tag segment"]  # the part of the segment that lies in the teacher's mask
     confidence: Float[Array, "time tag"]  # of the teacher
+    control: ControlReads | None = None  # (time,)
+
+    def of_control(self) -> PieceFrames:
+        """The same frames with the control's reads, which agree with no mask. Raises `ValueError` where there are none."""
+        if self.control is None:
+            raise ValueError("found a piece without control reads; expected one of `PieceFiles.made(controls=True)`.")
+        nothing = RadioWindow(jnp.zeros_like(self.radio.relative_m), jnp.full_like(self.radio.std_m, jnp.inf))
+        return dataclasses.replace(
+            self,
+            arrivals=self.control.arrivals,
+            radio=nothing,
+            present=self.control.present,
+            target=jnp.zeros_like(self.target),
+            confidence=jnp.zeros_like(self.confidence),
+            control=None,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +91,13 @@ def segment_pieces(
     epcs: Sequence[str],
     num_frames: int = 256,
     teacher: Teacher = "smoother",
+    control: TagReads | None = None,
 ) -> Iterator[Piece]:
     """The recording in pieces of at most `num_frames` frames of about equal length, in order of time.
 
     `tracer` gives the segments and, smoothed over the whole recording, the masks to learn from; with `teacher` labels these
-    are the true ones. `load` is as in `trace_recording`. The number of tags is padded to a power of two.
+    are the true ones. `load` is as in `trace_recording`. The number of tags is padded to a power of two. `control` are reads
+    that belong to nothing in the recording.
     """
     if num_frames < 1:
         raise ValueError(f"num_frames is {num_frames}; expected at least 1 frame a piece.")
@@ -91,12 +110,14 @@ def segment_pieces(
         taught = true_masks(recording, camera.rays.shape[:2], epcs)
     else:
         taught = smoother_masks(tracer, recording, load, epcs)
+    strange = None if control is None else control_reads(recording, control, camera, _padded_tags(len(epcs)))
     rows: list[Any] = []
     for (mask, confidence), (number, (outputs,)) in zip(taught, seen, strict=True):
         found, filled, time_s, depth_m, arrivals, radio = outputs
         target = _overlap(mask, filled, found.area.shape[0])
         there = np.ones(len(epcs), bool)
-        rows.append((time_s, depth_m, found, arrivals, radio, there, target, confidence))
+        own = jax.tree.map(lambda leaf, number=number: leaf[number], strange)
+        rows.append((time_s, depth_m, found, arrivals, radio, there, target, confidence, own))
         if number + 1 in ends:
             yield Piece(camera, _padded(rows), recording.name, number + 1 - len(rows), len(rows))
             rows = []
@@ -114,12 +135,13 @@ def _padded(rows: Sequence[Any]) -> PieceFrames:
     """The rows on a time axis, padded: with their last frame, at which then no tag is present and no read arrives."""
     after = -len(rows) % _FRAMES
     stacked = jax.tree.map(lambda *leaves: np.stack([*leaves, *leaves[-1:] * after]), *rows)
-    time_s, depth_m, found, arrivals, radio, present, target, confidence = stacked
-    present[len(rows) :] = False
-    arrivals.valid[len(rows) :] = False
+    time_s, depth_m, found, arrivals, radio, present, target, confidence, control = stacked
+    of_control = [] if control is None else [control.present, control.arrivals.valid]
+    for there in (present, arrivals.valid, *of_control):
+        there[len(rows) :] = False
     step_s = (time_s[len(rows) - 1] - time_s[0]) / np.float32(max(len(rows) - 1, 1))
     time_s[len(rows) :] += step_s * np.arange(1, after + 1, dtype=np.float32)
-    more = (1 << (present.shape[1] - 1).bit_length()) - present.shape[1]
+    more = _padded_tags(present.shape[1]) - present.shape[1]
 
     def more_tags(leaf: np.ndarray, fill: float = 0.0) -> Array:
         widths = [(0, 0), (0, more), *[(0, 0)] * (leaf.ndim - 2)]
@@ -134,4 +156,9 @@ def _padded(rows: Sequence[Any]) -> PieceFrames:
         present=more_tags(present),
         target=more_tags(target),
         confidence=more_tags(confidence),
+        control=jax.tree.map(jnp.asarray, control),
     )
+
+
+def _padded_tags(num_tags: int) -> int:
+    return 1 << (num_tags - 1).bit_length()
