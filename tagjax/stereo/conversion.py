@@ -23,6 +23,7 @@ from .pair_check import check_pairs
 from .pictures import open_pictures
 from .rectification import Rectification, rectify
 from .rig import StereoRig, read_rig
+from .steady import MAX_FRAMES, SteadyPictures
 
 _NAME_ENDING = "-stereo"
 _MAX_APART = 0.25  # of a frame, between the two cameras' times
@@ -40,6 +41,9 @@ class StereoSettings:
     fps: float | None = None  # frame rate, where videos or names of pictures have no times
     start: Any = None  # time of the first frame (ISO, or seconds since 1970); null: the times stay as they are
     match: MatchSettings = dataclasses.field(default_factory=MatchSettings)
+    average_s: float = (
+        0.27  # time over which what does not change is averaged before matching, at most 10 frames; 0: none
+    )
     reads: str | None = None
     format: str = "auto"
     hop_table_hz: tuple[float, ...] | None = None
@@ -61,6 +65,8 @@ class StereoSettings:
                 f"found {', '.join(given) or 'no pictures'}; expected left=<video or folder> right=<video or folder> camera=<file>, or "
                 "recording=<a recording with a second camera>."
             )
+        if not 0 <= self.average_s <= 60:
+            raise ConfigError(f"average_s is {self.average_s}; expected 0 (no average) to 60 s.")
         if self.fps is not None and not 0 < self.fps <= 1000:
             raise ConfigError(f"fps is {self.fps}; expected a frame rate above 0 and at most 1000.")
 
@@ -91,14 +97,18 @@ def stereo_recording(settings: StereoSettings, *, progress: bool = False) -> tup
     if (warning := checked.warning()) is not None:
         lines.append(warning)
 
+    num_averaged = _num_averaged(settings.average_s, plain.time_ns)
+    steady_left, steady_right = SteadyPictures(left, num_averaged), SteadyPictures(right, num_averaged)
+
     def depth(frame: int) -> np.ndarray:
-        return depth_of_pair(left[frame], right[frame], camera, baseline_m, settings.match)
+        return depth_of_pair(steady_left(frame), steady_right(frame), camera, baseline_m, settings.match)
 
     recording = dataclasses.replace(
         plain,
         depth=ComputedFrames((plain.num_frames, camera.height, camera.width), np.uint16, depth),
         name=valid_name(plain.name[: MAX_NAME - len(_NAME_ENDING)] + _NAME_ENDING),
-        source=f"{plain.source}; depth from two cameras {1000 * baseline_m:.1f} mm apart, {settings.match}",
+        source=f"{plain.source}; depth from two cameras {1000 * baseline_m:.1f} mm apart, {num_averaged} frames averaged, "
+        f"{settings.match}",
     )
     recording.check()
     lines.append(
@@ -109,6 +119,13 @@ def stereo_recording(settings: StereoSettings, *, progress: bool = False) -> tup
         save_recording(recording, settings.out, progress=progress)
         lines.append(f"saved as {settings.out}")
     return recording, lines
+
+
+def _num_averaged(average_s: float, time_ns: np.ndarray) -> int:
+    """The number of frames in `average_s`, from 1 to `MAX_FRAMES`."""
+    if len(time_ns) < 2:
+        return 1
+    return int(np.clip(1 + np.floor(average_s * 1e9 / np.median(np.diff(time_ns))), 1, MAX_FRAMES))
 
 
 def _of_recording(settings: StereoSettings) -> tuple[Recording, LazyArray, Rectification, list[str]]:

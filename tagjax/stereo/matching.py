@@ -1,4 +1,4 @@
-"""Disparity of a rectified pair by OpenCV's semi-global matching, checked from right to left, and metric depth."""
+"""Disparity of a rectified pair by OpenCV's semi-global matching, checked from right to left and smoothed; metric depth."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8, UInt16
 
 from ..core.camera import Intrinsics
 from ..core.settings import ConfigError
+from .smoothing import smooth_disparity
 
 MAX_DISPARITIES = 1024
 """Largest number of disparities that are searched: more would take minutes a picture."""
@@ -45,6 +46,7 @@ class MatchSettings:
     border_px: int = (
         9  # radius within which borders of near objects are compared with what has their colour; 0: they are not
     )
+    smoothing: float = 200.0  # strength of the smoothing within edges of the picture, as of `smooth_disparity`; 0: none
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.near_m < self.far_m <= 1000:
@@ -57,6 +59,8 @@ class MatchSettings:
             raise ConfigError(
                 f"smoothness is {self.smoothness}, max_difference_px {self.max_difference_px}; expected values above 0."
             )
+        if not 0 <= self.smoothing <= 1e5:
+            raise ConfigError(f"smoothing is {self.smoothing}; expected 0 (none) to 100000.")
         if not 0 <= self.uniqueness_percent < 100 or self.min_patch_px < 0 or not 0 <= self.border_px <= 50:
             raise ConfigError(
                 f"uniqueness_percent is {self.uniqueness_percent}, min_patch_px {self.min_patch_px}, border_px {self.border_px}; expected "
@@ -103,7 +107,8 @@ def disparity_of_pair(
     found = _without_small_patches(found, patch_px)
     if settings.border_px:
         found = _without_widened_borders(left, found, settings.border_px)
-    return _refined(left, right, found, settings.block_px + 2)
+    found, texture = _refined(left, right, found, settings.block_px + 2)
+    return smooth_disparity(found, texture, left, settings.smoothing) if settings.smoothing > 0 else found
 
 
 def depth_of_disparity(
@@ -196,13 +201,13 @@ def _without_widened_borders(
 
 def _refined(
     left: np.ndarray, right: np.ndarray, disparity_px: np.ndarray, window_px: int
-) -> Float[np.ndarray, "height width"]:
-    """Disparities to a fraction of a pixel, by two Gauss-Newton steps on the grey values of a window (Lucas and Kanade, 1981).
+) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Disparities to a fraction of a pixel, and the texture that they rest on, by two Gauss-Newton steps on the grey values of a window (Lucas and Kanade, 1981).
 
     Semi-global matching interpolates costs of whole pixels, which draws disparities towards whole pixels, by 0.1 px or so: a
     distance that changes evenly would seem to change in steps. Every pixel of the window is compared at its own disparity, and
     means are subtracted, so that neither depth edges nor a difference in exposure moves the result. Windows without texture
-    keep what they have.
+    keep what they have. The texture is the window's mean square of the slope, (grey levels a pixel)^2, 0 without a disparity.
     """
     one, other = (
         cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (left, right)
@@ -212,7 +217,7 @@ def _refined(
     count = np.maximum(_box(known, window_px), np.float32(1e-3))
     grid = np.indices(disparity_px.shape, np.float32)
     y, x = grid[0], grid[1]
-    found = disparity_px.copy()
+    found, square = disparity_px.copy(), np.zeros_like(disparity_px)
     for _ in range(2):
         seen = cv2.remap(other, x - found, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         along = cv2.remap(slope, x - found, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) * known
@@ -221,7 +226,7 @@ def _refined(
         both = _box(error * along, window_px) / count - mean_error * mean_slope
         square = _box(along * along, window_px) / count - mean_slope * mean_slope
         found = found - np.clip(both / (square + _NOISE), -0.5, 0.5) * known
-    return np.clip(found, disparity_px - 1, disparity_px + 1) * known
+    return np.clip(found, disparity_px - 1, disparity_px + 1) * known, np.maximum(square, 0) * known
 
 
 def _box(image: np.ndarray, side_px: int) -> np.ndarray:

@@ -53,6 +53,7 @@ def check_pairs(
     pairs: Sequence[tuple[np.ndarray, np.ndarray]], focal_px: float, baseline_m: float, settings: MatchSettings
 ) -> PairCheck:
     """Match some rectified pairs as they are, exchanged, and moved by three rows up and down."""
+    settings = dataclasses.replace(settings, smoothing=0.0)  # which changes no count
 
     def matched(one: np.ndarray, other: np.ndarray) -> float:
         return float(np.mean(disparity_of_pair(one, other, focal_px, baseline_m, settings) > 0))
