@@ -111,7 +111,9 @@ def next_front(
     background = last.background + part * (own - last.background)
     paused_s = np.where(near, np.minimum(paused_s, settings.pause_s), 0.0)
     front_s = np.where(near, front_s + np.where(other, dt_s, 0.0), 0.0).astype(np.float32)
-    return Front(own, near, paused_s.astype(np.float32), front_s, background.astype(np.float32), rest_s.astype(np.float32))
+    return Front(
+        own, near, paused_s.astype(np.float32), front_s, background.astype(np.float32), rest_s.astype(np.float32)
+    )
 
 
 def differs(

@@ -30,15 +30,15 @@ _LOST_VARIANCE = 6.0  # rad^2: modulo 2 pi a phase that is less certain than thi
 class DepthBelief(eqx.Module):
     """A normal distribution over (log depth, its rate 1/s, phase at each antenna in rad); the state's axes come first."""
 
-    mean: Float[Array, "state *batch"]
+    mean: Float[Array, " state *batch"]
     covariance: Float[Array, "state state *batch"]
 
 
 class Ranges(eqx.Module):
     """The phases of a segment's ranges at its most probable depth, and their derivatives by the log depth; both rad."""
 
-    phase: Float[Array, "antenna *batch"]
-    slope: Float[Array, "antenna *batch"]
+    phase: Float[Array, " antenna *batch"]
+    slope: Float[Array, " antenna *batch"]
 
 
 def ranges_at(
@@ -49,7 +49,8 @@ def ranges_at(
 ) -> Ranges:
     """The phases (not modulo anything) of the places at these depths on the rays; `wave` is their phase a metre, rad/m."""
     depth_m = jnp.exp(log_depth)
-    place = depth_m * ray[:, 0], depth_m * ray[:, 1], depth_m
+    x, y = (jnp.broadcast_to(axis, depth_m.shape) for axis in ray.T)
+    place = depth_m * x, depth_m * y, depth_m
     phases, slopes = [], []
     for antenna_m in antennas_m:
         away = [axis - other for axis, other in zip(place, antenna_m, strict=True)]
@@ -106,7 +107,7 @@ def with_phase_variance(
 
 def _of_antenna(
     belief: DepthBelief, antenna: Float[Array, " antenna"]
-) -> tuple[Float[Array, "*batch"], Float[Array, "state *batch"], Float[Array, "*batch"]]:
+) -> tuple[Float[Array, "*batch"], Float[Array, " state *batch"], Float[Array, "*batch"]]:
     """The phase at an antenna (1 in a vector of zeros), its covariance with the state, and its variance."""
     column = jnp.einsum("a,sa...->s...", antenna, belief.covariance[:, _PHASES:])
     return (
@@ -130,9 +131,9 @@ def with_phase_set(
     expected, column, spread = _of_antenna(belief, antenna)
     g = jnp.concatenate([jnp.zeros(2), shifted]).reshape(-1, *[1] * (belief.mean.ndim - 1))
     cross = g[:, None] * column[None]
-    own = g[:, None] * g[None] * (spread + variance)
+    own = g[:, None] * g[None] * (spread + variance)[None, None]
     covariance = belief.covariance - cross - jnp.swapaxes(cross, 0, 1) + own
-    return DepthBelief(belief.mean + g * (phase_rad - expected), covariance)
+    return DepthBelief(belief.mean + g * (phase_rad - expected)[None], covariance)
 
 
 def with_read(
@@ -161,19 +162,22 @@ def with_read(
     first, second = jnp.sum(weight * apart, axis=0), jnp.sum(weight * jnp.square(apart), axis=0)
     shift = fraction * first
     left = fraction * second + (1.0 - fraction) * total - jnp.square(shift)
-    gain = column / total
-    covariance = belief.covariance - gain[:, None] * gain[None] * jnp.clip(total - left, 0.0, None)
-    read = _positive(DepthBelief(belief.mean + gain * shift, covariance))
+    gain = column / total[None]
+    covariance = belief.covariance - gain[:, None] * gain[None] * jnp.clip(total - left, 0.0, None)[None, None]
+    read = _positive(DepthBelief(belief.mean + gain * shift[None], covariance))
     begun = with_phase_set(belief, antenna, phase_rad, variance, antenna)
-    belief = jax.tree.map(lambda a, b: jnp.where(lost, a, b), begun, read)
-    return belief, jnp.where(lost, 0.0, jnp.log(likelihood))
+    after = DepthBelief(
+        jnp.where(lost[None], begun.mean, read.mean),
+        jnp.where(lost[None, None], begun.covariance, read.covariance),
+    )
+    return after, jnp.where(lost, 0.0, jnp.log(likelihood))
 
 
 def with_rate(belief: DepthBelief, rate: Float[Array, "*#batch"], variance: Float[Array, "*#batch"]) -> DepthBelief:
     """The belief after a measurement of the log depth's rate, 1/s, such as a change of scale; an infinite variance says nothing."""
     column = belief.covariance[:, _RATE]
-    gain = column / (column[_RATE] + variance)
-    mean = belief.mean + gain * (rate - belief.mean[_RATE])
+    gain = column / (column[_RATE] + variance)[None]
+    mean = belief.mean + gain * (rate - belief.mean[_RATE])[None]
     return _positive(DepthBelief(mean, belief.covariance - gain[:, None] * column[None]))
 
 

@@ -366,7 +366,15 @@ class TagAttention(AbstractSmoother):
         if pooling is not None:
             motion = self.unknown_depth.with_scale(motion, state, found, pooling, now_s - since_s)
         return self.unknown_depth.step(
-            self.reader, self.dwell.memory_s.value, state, arrivals, camera.antennas_m, motion, found.source, since_s, now_s
+            self.reader,
+            self.dwell.memory_s.value,
+            state,
+            arrivals,
+            camera.antennas_m,
+            motion,
+            found.source,
+            since_s,
+            now_s,
         )
 
     def _bodies(

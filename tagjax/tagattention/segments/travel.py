@@ -135,7 +135,8 @@ class TravellingTogether(eqx.Module):
         pooled = there & (total > 1.0)
         pooling = Pooling(active, pooled, weight, lagged, elapsed_s[active])
         motion_m = pooling.mean(motion_m)
-        increment_m = pooling.mean(increment_m.T).T
+        own = increment_m[:, active]
+        increment_m = increment_m.at[:, active].set(jnp.where(pooled[None], own @ weight.T, own))
 
         after = _inherit(state, source)
         displacement_m = after.displacement_m + jnp.where(newborn[:, None], 0.0, motion_m)

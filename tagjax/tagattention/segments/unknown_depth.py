@@ -78,10 +78,16 @@ class RayMotion(eqx.Module):
 
 
 class UnknownDepth(eqx.Module):
-    """Stage that is used in place of dwells where nothing measures depth. `UnknownDepth()` has good values."""
+    """Stage that is used in place of dwells where nothing measures depth. `UnknownDepth()` has good values.
+
+    The frames' depth is nominal (`flow.nominal_depth`), and so are places and steps of a `Trace`. Calibrated antennas are needed,
+    at least two of them for rays to be told apart without the change of scale. Measured on simulated recordings only.
+    """
 
     settle_s: Positive  # a motion in depth is forgotten within this time
-    rate_per_speed: Positive  # standard deviation of the log depth's rate, per speed of the ray: 1 = all directions alike
+    rate_per_speed: (
+        Positive  # standard deviation of the log depth's rate, per speed of the ray: 1 = all directions alike
+    )
     still_rate: Positive  # the same of a ray at rest, 1/s
     drift_m: Positive  # variance of a change of range, m^2, for each metre: reflections, and errors of the ray's motion
     hop_rad: Positive  # what a hop changes in the phase of one antenna against the others: reflections
@@ -168,7 +174,7 @@ class UnknownDepth(eqx.Module):
         fastest = jnp.where(moving, fastest, 0.0)
         rate_std = jnp.where(moving, self.rate_per_speed.value * fastest + self.still_rate.value, 0.0)
         rate_variance = jnp.where(moving, motion.rate_variance, jnp.inf)
-        belief = jax.vmap(lambda one: with_rate(one, motion.rate, rate_variance))(state.belief)
+        belief = jax.vmap(lambda one: with_rate(one, motion.rate[None], rate_variance[None]))(state.belief)
         log_hypothesis = jnp.exp(-(now_s - since_s) / memory_s) * state.log_hypothesis
 
         def gone_on(
@@ -181,12 +187,10 @@ class UnknownDepth(eqx.Module):
             log_depth, rate = belief.mean[0], belief.mean[1]
             last = ranges_at(log_depth, places[0], antennas_m, wave)
             now = ranges_at(log_depth + elapsed_s * rate, places[1], antennas_m, wave)
-            now = eqx.tree_at(lambda one: one.slope, now, jnp.where(moving, now.slope, 0.0))
-            last = eqx.tree_at(lambda one: one.slope, last, jnp.where(moving, last.slope, 0.0))
+            now = eqx.tree_at(lambda one: one.slope, now, jnp.where(moving[None, None], now.slope, 0.0))
+            last = eqx.tree_at(lambda one: one.slope, last, jnp.where(moving[None, None], last.slope, 0.0))
             error = wave * self.drift_m.value * jnp.abs(now.phase - last.phase)
-            return settled(
-                moved(belief, last, now, elapsed_s, error), elapsed_s, rate_std, self.settle_s.value
-            )
+            return settled(moved(belief, last, now, elapsed_s, error), elapsed_s, rate_std[None], self.settle_s.value)
 
         def updated(carry, one: Arrivals):
             belief, seen, channel, carrier_hz, time_s, evidence = carry
@@ -195,7 +199,7 @@ class UnknownDepth(eqx.Module):
             antenna = (jnp.arange(antennas_m.shape[0]) == one.antenna).astype(own.mean.dtype)
             hops, unseen = one.channel != channel[at], ~seen[at, one.antenna]
             own = self._hopped(reader, own, hops, carrier_hz[at], one.carrier_hz, motion.ray, antennas_m)
-            variance = 1.0 / reader.concentration(one.rssi_dbm, fastest * jnp.exp(own.mean[0]))
+            variance = 1.0 / reader.concentration(one.rssi_dbm, fastest[None] * jnp.exp(own.mean[0]))
             phase_rad = reader.multiple * one.phase_rad
             shifted = jnp.where(unseen, antenna, jnp.ones_like(antenna))
             begun = with_phase_set(own, antenna, phase_rad, variance, shifted)
@@ -297,15 +301,14 @@ class UnknownDepth(eqx.Module):
         begun = covariance.at[:, :2].set(0.0).at[:, :, :2].set(0.0).at[:, 0, 0].set(jnp.square(std))
         evidence = of_sources(state.log_hypothesis)
         unknown = jnp.maximum(of_sources(state.log_likelihood), 0.0)[:, None]
-        belief = DepthBelief(
-            mean.at[:, 0].set(jnp.where(fresh, log_depth[:, None], mean[:, 0]))
-            .at[:, 1].set(jnp.where(fresh, 0.0, mean[:, 1])),
-            jnp.where(fresh, begun, covariance),
-        )  # fmt: skip
+        rows = fresh[None, None]  # of tags and depths
+        depths = jnp.where(rows, log_depth[None, :, None], mean[:, 0])
+        mean = mean.at[:, 0].set(depths).at[:, 1].set(jnp.where(rows, 0.0, mean[:, 1]))
+        belief = DepthBelief(mean, jnp.where(rows[None, None], begun, covariance))
         return eqx.tree_at(
             lambda s: (s.belief, s.log_hypothesis, s.fastest),
             state,
-            (belief, jnp.where(fresh, unknown, evidence), jnp.where(fresh, 0.0, state.fastest[source])),
+            (belief, jnp.where(rows, unknown, evidence), jnp.where(fresh, 0.0, state.fastest[source])),
         )
 
 
