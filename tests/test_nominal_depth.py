@@ -48,7 +48,7 @@ def test_a_pause_is_bridged_and_a_stop_is_not() -> None:
     settings = NominalDepth()
     frames = round(settings.pause_s / DT_S)
     found = _fronts([*range(5, 25), *[24] * (2 * frames)], settings)
-    for number, expected in ((19 + frames // 2, 0.95), (-1, 0.0)):
+    for number, expected in ((19 + frames // 2, 1.0), (-1, 0.0)):
         front, mask = found[number]
         assert front.near[mask].mean() == pytest.approx(expected, abs=0.05)
 

@@ -13,6 +13,7 @@ import pytest
 from tagjax.radio.arrivals import Arrivals
 from tagjax.radio.reader_model import ReaderModel
 from tagjax.tagattention import TagAttention
+from tagjax.tagattention.segments.attention import AttentionEvidence
 from tagjax.tagattention.segments.unknown_depth import RayMotion, UnknownDepth
 
 ANTENNAS_M = np.array([[0.0, 0.9, 0.1], [0.8, 0.7, 0.1], [-0.8, 0.7, 0.1], [0.0, -0.3, 0.1]])
@@ -59,29 +60,29 @@ def _reads(num_antennas: int, *, still: bool, hop_s: float = 0.2) -> Arrivals:
     )
 
 
-@functools.cache
-def _evidence(num_antennas: int, *, still: bool = False) -> np.ndarray:
-    """(frames, segment)."""
-    stage, reader = UnknownDepth(num_depths=4), ReaderModel()
-    time_s, places, _ = _scene()
-    rays = jnp.asarray(places[..., :2] / places[..., 2:], jnp.float32)
-    turns = jnp.diff(rays, axis=0, prepend=rays[:1])
-    none = jnp.zeros(4), jnp.full(4, jnp.inf)
-    antennas = jnp.asarray(ANTENNAS_M[:num_antennas], jnp.float32)
+@eqx.filter_jit
+def _traced(antennas_m, begin, inputs):
+    stage, reader, none = UnknownDepth(num_depths=4), ReaderModel(), (jnp.zeros(4), jnp.full(4, jnp.inf))
 
     def step(carry, one):
         state, last_s = carry
         arrivals, ray, turn, now_s = one
-        motion = RayMotion(ray, turn, *none)
-        state, evidence = stage.step(
-            reader, jnp.array(4.0), state, arrivals, antennas, motion, NO_NEWBORN, last_s, now_s
-        )
+        motion, memory_s = RayMotion(ray, turn, *none), jnp.array(4.0)
+        state, evidence = stage.step(reader, memory_s, state, arrivals, antennas_m, motion, NO_NEWBORN, last_s, now_s)
         return (state, now_s), evidence[0]
 
-    times = jnp.asarray(time_s, jnp.float32)
-    begin = stage.init(1, num_antennas, 4), times[0]
-    run = eqx.filter_jit(lambda begin, inputs: jax.lax.scan(step, begin, inputs)[1])
-    return np.asarray(run(begin, (_reads(num_antennas, still=still), rays, turns, times)))
+    return jax.lax.scan(step, begin, inputs)[1]
+
+
+@functools.cache
+def _evidence(num_antennas: int, *, still: bool = False) -> np.ndarray:
+    """(frames, segment)."""
+    time_s, places, _ = _scene()
+    rays = jnp.asarray(places[..., :2] / places[..., 2:], jnp.float32)
+    turns, times = jnp.diff(rays, axis=0, prepend=rays[:1]), jnp.asarray(time_s, jnp.float32)
+    begin = UnknownDepth(num_depths=4).init(1, num_antennas, 4), times[0]
+    antennas_m = jnp.asarray(ANTENNAS_M[:num_antennas], jnp.float32)
+    return np.asarray(_traced(antennas_m, begin, (_reads(num_antennas, still=still), rays, turns, times)))
 
 
 def test_four_antennas_find_the_ray_of_the_tag() -> None:
@@ -129,4 +130,4 @@ def test_errors() -> None:
     with pytest.raises(ValueError, match="expected at least 1 depth, and min_m below max_m"):
         UnknownDepth(min_m=4.0, max_m=2.0)
     with pytest.raises(ValueError, match="unknown_depth is on and dwell is off"):
-        TagAttention(unknown_depth=UnknownDepth(), dwell=None, hidden=None, attention=None)
+        TagAttention(unknown_depth=UnknownDepth(), dwell=None, hidden=None, free=None, attention=AttentionEvidence())

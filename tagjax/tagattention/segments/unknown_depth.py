@@ -10,6 +10,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Positive
@@ -129,9 +130,10 @@ class UnknownDepth(eqx.Module):
 
     def _depths(self) -> tuple[Float[Array, " hypothesis"], Float[Array, ""]]:
         """The log depths that the stage begins with, and their standard deviation: half of what lies between two."""
-        low, high = jnp.log(self.min_m), jnp.log(self.max_m)
+        low, high = np.log(self.min_m), np.log(self.max_m)
         step = (high - low) / self.num_depths
-        return low + step * (jnp.arange(self.num_depths) + 0.5), 0.5 * step
+        depths = low + step * (np.arange(self.num_depths) + 0.5)
+        return jnp.asarray(depths, jnp.float32), jnp.asarray(0.5 * step, jnp.float32)
 
     def init(self, num_tags: int, num_antennas: int, num_segments: int) -> UnknownDepthState:
         """Before the first read."""
@@ -225,7 +227,7 @@ class UnknownDepth(eqx.Module):
         begin = belief, state.seen, state.channel, state.carrier_hz, times, log_hypothesis
         (belief, seen, channel, carrier_hz, times, log_hypothesis), _ = jax.lax.scan(add, begin, arrivals)
         belief = jax.vmap(gone_on, in_axes=(0, 0, 0, None))(belief, carrier_hz, times, now_s)
-        log_likelihood = jax.nn.logsumexp(log_hypothesis, axis=1) - jnp.log(float(self.num_depths))
+        log_likelihood = jax.nn.logsumexp(log_hypothesis, axis=1) - float(np.log(self.num_depths))
         after = UnknownDepthState(belief, log_hypothesis, log_likelihood, fastest, seen, channel, carrier_hz)
         return after, log_likelihood
 
