@@ -28,10 +28,13 @@ _LOST_VARIANCE = 6.0  # rad^2: modulo 2 pi a phase that is less certain than thi
 
 
 class DepthBelief(eqx.Module):
-    """A normal distribution over (log depth, its rate 1/s, phase at each antenna in rad); the state's axes come first."""
+    """A normal distribution over (log depth, its rate 1/s, phase at each antenna in rad).
 
-    mean: Float[Array, " state *batch"]
-    covariance: Float[Array, "state state *batch"]
+    The functions below take one tag's, of which the state's axes come first. Of several tags the tags' axis comes before them.
+    """
+
+    mean: Float[Array, "*rows"]
+    covariance: Float[Array, "*table"]
 
 
 class Ranges(eqx.Module):
