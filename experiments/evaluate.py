@@ -4,6 +4,7 @@ python -m experiments.evaluate run=outputs/train/<time> 'recordings=[c.zarr]'
 python -m experiments.evaluate weights=default 'recordings=[c.zarr]'                  # with the clips it was trained with
 python -m experiments.evaluate tracer=tagattention_published suite=single_static        # its test split
 python -m experiments.evaluate tracer=tagattention tracer@baselines.published=tagattention_published 'recordings=[c.zarr]'
+python -m experiments.evaluate tracer=tagattention_rgb depth=none 'recordings=[c.zarr]'     # a colour camera, several antennas
 python -m experiments.evaluate run=<folder> 'recordings=[c.zarr]' virtual_tag.tracks=tracks.csv 'virtual_tag.seeds=[0]'
 """
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ..core.progress import progress_lines
 from ..core.settings import ConfigError, changed, from_mapping
+from ..flow.nominal_depth import NominalDepth, without_depth
 from ..metrics.recordings import ScoreSettings
 from ..recording import Recording
 from ..recording.controls import Control, with_control
@@ -76,6 +77,8 @@ def run_evaluation(
     clips = changed(clips, config.clips, where="clips")
     epcs = clips.epcs if config.epcs is None else config.epcs
     recordings = with_control(recordings + open_recordings(config.recordings, config.virtual_tag), config.control)
+    if config.depth == "none":
+        recordings = [without_depth(one, config.nominal_depth) for one in recordings]
     if not recordings:
         raise ConfigError(
             "No recording to evaluate on: expected recordings=[a.zarr,...] or suite=<name>, or a run with validation recordings."
@@ -114,6 +117,8 @@ class EvaluateConfig:
     baselines: Mapping[str, Mapping[str, Any]] | None = None
     virtual_tag: VirtualTagSettings = dataclasses.field(default_factory=VirtualTagSettings)
     control: Control | None = None  # reads that do not belong to what is seen: every detection is a false one
+    depth: Literal["none"] | None = None  # none: two planes in place of the depth, as of a recording without any
+    nominal_depth: NominalDepth = dataclasses.field(default_factory=NominalDepth)
     scores: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # override those of the run
     progress: bool = True
 

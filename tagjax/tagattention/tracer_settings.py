@@ -67,11 +67,13 @@ def tracer_clips(settings: Mapping[str, Any]) -> ClipSettings:
 def settled(settings: Mapping[str, Any], width: int) -> dict[str, Any]:
     """Settings whose `clips`, if any, have the stride for pictures of this width in place of an automatic one.
 
-    Scores are stored under what determines them: a stride that follows from the width is the same as one that is given.
+    Scores are stored under what determines them: a stride that follows from the width is the same as one that is given, and
+    depth that is measured the same as before depth could be unknown.
     """
     clips = settings.get("clips")
+    settings = {key: value for key, value in settings.items() if key != "unknown_depth" or value is not None}
     if not clips:
-        return dict(settings)
+        return settings
     return {**settings, "clips": {**clips, "stride": working_stride(width, clips.get("stride"))}}
 
 

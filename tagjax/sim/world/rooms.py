@@ -290,7 +290,7 @@ def _screens_and_things(plan: Plan, rng: np.random.Generator, desk: Table, row: 
 
 
 def _room(name: str, plan: Plan, rng: np.random.Generator, size: Point, area: Rectangle, door: Door | None) -> Room:
-    """A room seen from its near wall, lights at the ceiling, one antenna below the camera."""
+    """A room seen from its near wall, lights at the ceiling; the antennas below the camera, left, right and above."""
     length, width, height = size
     lights = tuple(
         Light((fraction * length, float(rng.uniform(-0.25, 0.25)) * width, height - 0.15), float(rng.uniform(0.6, 1.0)))
@@ -308,7 +308,7 @@ def _room(name: str, plan: Plan, rng: np.random.Generator, size: Point, area: Re
         lights=lights,
         camera_position_m=camera,
         camera_look_at_m=(0.55 * length, float(rng.uniform(-0.2, 0.2)), float(rng.uniform(0.75, 1.0))),
-        antennas_m=((-0.3, y, 1.2), (-0.3, y + 0.8, 1.4), (-0.3, y - 0.8, 1.4)),
+        antennas_m=((-0.3, y, 1.2), (-0.3, y + 0.8, 1.4), (-0.3, y - 0.8, 1.4), (-0.3, y, 2.4)),
         panels=tuple(plan.panels),
         door=door,
         ambient=float(rng.uniform(0.25, 0.45)),

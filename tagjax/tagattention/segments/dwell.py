@@ -56,6 +56,14 @@ class DwellState(eqx.Module):
             log_likelihood=jnp.zeros((num_tags, num_segments)),
         )
 
+    def with_evidence(self, log_likelihood: Float[Array, "tag segment"]) -> DwellState:
+        """The state with this evidence."""
+        return eqx.tree_at(lambda one: one.log_likelihood, self, log_likelihood)
+
+    def of_tags(self) -> list[Array]:
+        """The arrays with one row a tag."""
+        return [self.real, self.imaginary, self.read_m, self.channel, self.log_likelihood]
+
     @property
     def moved_m(self) -> Float[Array, "tag antenna segment"]:
         """Distance moved since the dwell's last read."""

@@ -18,6 +18,7 @@ from .free_path import FreePathState
 from .hidden import HiddenState
 from .step import SegmentTrackerState
 from .travel import TravelState
+from .unknown_depth import UnknownDepthState
 
 
 class TagState(eqx.Module):
@@ -25,7 +26,7 @@ class TagState(eqx.Module):
 
     time_s: Float[Array, ""]  # of the last frame; NaN before the first
     travel: TravelState | None
-    dwell: DwellState | None
+    dwell: DwellState | UnknownDepthState | None
     attention: AttentionState | None
     body: BodyState | None
     hidden: HiddenState | None
@@ -51,8 +52,7 @@ def of_tags(state: TagState) -> list[Any]:
     """The arrays with one row a tag."""
     found = [*jax.tree.leaves(state.recent), *jax.tree.leaves(state.hidden), *jax.tree.leaves(state.free)]
     if state.dwell is not None:
-        dwell = state.dwell
-        found += [dwell.real, dwell.imaginary, dwell.read_m, dwell.channel, dwell.log_likelihood]
+        found += state.dwell.of_tags()
     if state.attention is not None:
         found.append(state.attention.log_likelihood)
     return found if state.body is None else [*found, state.body.membership]

@@ -4,7 +4,8 @@ A frame passes through them in this order:
 
 1. `segments`: depth and flow -> persistent segments and each one's motion (shared by all tags);
 2. `travel`: what moves together -> motion that is pooled, and pasts that outlive a segment (shared as well);
-3. `dwell`, with the `reader`'s noise model: this frame's reads -> evidence for each tag at each segment;
+3. `dwell`, with the `reader`'s noise model: this frame's reads -> evidence for each tag at each segment; where nothing
+   measures depth, `unknown_depth` finds it;
 4. `body`: evidence and motion in space -> which segments belong to the rigid body that carries the tag;
 5. `whole`: what is connected with a body that walks, and gets on as it does -> the whole of it;
 6. `hidden`: the last body -> its evidence where it comes out again, and whether the tag is out of view;
@@ -24,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, Int8
 
 from ...core.constrained import named_values, with_named_values
 from ...core.numerics import safe_divide
+from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
 from ...tracing.status import Status
 from ...tracing.tracer import AbstractSmoother, Camera, Evidence, Frame, Trace
@@ -48,6 +50,7 @@ from .outline import (
 from .state import TagAttentionState, TagState, last_s, of_tags, times
 from .step import SegmentFrame, SegmentTracker
 from .travel import Pooling, TravellingTogether
+from .unknown_depth import RayMotion, UnknownDepth, UnknownDepthState
 from .whole import WholeBody
 
 CAMERA_MOVED_FRACTION = 0.8
@@ -107,6 +110,7 @@ class TagAttention(AbstractSmoother):
     travel: TravellingTogether | None = eqx.field(default_factory=TravellingTogether)
     reader: ReaderModel = eqx.field(default_factory=ReaderModel)
     dwell: DwellEvidence | None = eqx.field(default_factory=DwellEvidence)
+    unknown_depth: UnknownDepth | None = None
     attention: AttentionEvidence | None = None
     body: CarryingBody | None = eqx.field(default_factory=CarryingBody)
     whole: WholeBody | None = eqx.field(default_factory=WholeBody)
@@ -121,6 +125,8 @@ class TagAttention(AbstractSmoother):
             raise ValueError("hidden is on and dwell is off; expected dwell for it. Set hidden to null.")
         if self.free is not None and self.dwell is None:
             raise ValueError("free is on and dwell is off; expected dwell, whose memory it shares. Set free to null.")
+        if self.unknown_depth is not None and self.dwell is None:
+            raise ValueError("unknown_depth is on and dwell is off; expected dwell, whose memory it has.")
         if self.whole is not None and self.body is None:
             raise ValueError("whole is on and body is off; expected a body that it completes. Set whole to null.")
 
@@ -139,7 +145,9 @@ class TagAttention(AbstractSmoother):
         """The state of the tags before the first frame: what `associate` begins with."""
         num_segments = self.segments.segmenter.num_segments
         dwell = attention = None
-        if self.dwell is not None:
+        if self.unknown_depth is not None:
+            dwell = self.unknown_depth.init(num_tags, num_antennas, num_segments)
+        elif self.dwell is not None:
             dwell = DwellState.nothing(num_tags, num_antennas, num_segments)
         if self.attention is not None:
             attention = AttentionState.nothing(num_tags, num_antennas, num_segments, num_window, time_s)
@@ -239,7 +247,7 @@ class TagAttention(AbstractSmoother):
         travel, pooling = state.travel, None
         if self.travel is not None and travel is not None:
             travel, found, pooling = self.travel.step(travel, found, since_s, now_s)
-        dwell, attention, own = self._evidence(state, found, pooling, frame)
+        dwell, attention, own = self._evidence(camera, state, found, pooling, frame)
         later: Hindsight | None = frame.backward_message
         evidence, later_body = own, None
         if later is not None:
@@ -298,8 +306,8 @@ class TagAttention(AbstractSmoother):
         )
 
     def _evidence(
-        self, state: TagState, found: SegmentFrame, pooling: Pooling | None, frame: Frame
-    ) -> tuple[DwellState | None, AttentionState | None, Float[Array, "tag segment"]]:
+        self, camera: Camera, state: TagState, found: SegmentFrame, pooling: Pooling | None, frame: Frame
+    ) -> tuple[DwellState | UnknownDepthState | None, AttentionState | None, Float[Array, "tag segment"]]:
         """The states of the stages that use reads, and their evidence."""
         assert frame.arrivals is not None
         assert frame.present is not None
@@ -308,15 +316,12 @@ class TagAttention(AbstractSmoother):
         dwell, attention = state.dwell, state.attention
         evidence = jnp.zeros((frame.present.shape[0], found.area.shape[0]))
         if self.dwell is not None and dwell is not None:
-            dwell, evidence = self.dwell.step(
-                self.reader, dwell, frame.arrivals, found.increment_m, found.centre_m[:, 2], found.source,
-                since_s, now_s, found.area > 0,
-            )  # fmt: skip
+            dwell, evidence = self._of_reads(camera, dwell, found, pooling, frame.arrivals, since_s, now_s)
             if self.hidden is not None and state.hidden is not None:
                 evidence = self.hidden.inherited(state.hidden, evidence, found.centre_m, found.source > -2)
             if self.travel is not None and pooling is not None:
                 evidence = self.travel.heal(pooling, evidence, dt_s)
-            dwell = eqx.tree_at(lambda one: one.log_likelihood, dwell, evidence)
+            dwell = dwell.with_evidence(evidence)
         if self.attention is not None and attention is not None:
             attention, agreed = self.attention.step(
                 attention, frame.radio, found.increment_m, found.known, found.source, since_s, now_s
@@ -336,6 +341,41 @@ class TagAttention(AbstractSmoother):
             self.reader, state.free, frame.arrivals, self.dwell.memory_s.value, since_s, frame.time_s
         )
         return after, after.log_likelihood, added
+
+    def _of_reads(
+        self,
+        camera: Camera,
+        state: DwellState | UnknownDepthState,
+        found: SegmentFrame,
+        pooling: Pooling | None,
+        arrivals: Arrivals,
+        since_s: Float[Array, ""],
+        now_s: Float[Array, ""],
+    ) -> tuple[DwellState | UnknownDepthState, Float[Array, "tag segment"]]:
+        """The state after the frame's reads, and their evidence: from the segments' ranges, or from their rays alone."""
+        assert self.dwell is not None
+        if self.unknown_depth is None:
+            assert isinstance(state, DwellState)
+            return self.dwell.step(
+                self.reader, state, arrivals, found.increment_m, found.centre_m[:, 2], found.source,
+                since_s, now_s, found.area > 0,
+            )  # fmt: skip
+        assert isinstance(state, UnknownDepthState)
+        motion_m = found.motion_m if pooling is None else pooling.mean(found.motion_m)
+        motion = RayMotion.of(found.centre_m, motion_m)
+        if pooling is not None:
+            motion = self.unknown_depth.with_scale(motion, state, found, pooling, now_s - since_s)
+        return self.unknown_depth.step(
+            self.reader,
+            self.dwell.memory_s.value,
+            state,
+            arrivals,
+            camera.antennas_m,
+            motion,
+            found.source,
+            since_s,
+            now_s,
+        )
 
     def _bodies(
         self,

@@ -38,6 +38,13 @@ class Pooling(eqx.Module):
     active: Int[Array, " active"]  # the segments that move fastest
     pooled: Bool[Array, " active"]  # some motion was measured nearby
     weight: Float[Array, "active active"]  # rows sum to 1
+    lagged_m: Float[Array, "active 3"]  # displacement over `lagged_s`: `lag_s`, or since birth where that is shorter
+    lagged_s: Float[Array, " active"]
+
+    def mean(self, values: Float[Array, "segment axis"]) -> Float[Array, "segment axis"]:
+        """The values of the segments that are pooled, each a mean over those it is pooled with."""
+        own = values[self.active]
+        return values.at[self.active].set(jnp.where(self.pooled[:, None], self.weight @ own, own))
 
 
 class TravellingTogether(eqx.Module):
@@ -126,7 +133,8 @@ class TravellingTogether(eqx.Module):
         total = jnp.sum(weight, axis=1)
         weight = (weight + _SELF * jnp.eye(num_active)) / (total + _SELF)[:, None]
         pooled = there & (total > 1.0)
-        motion_m = motion_m.at[active].set(jnp.where(pooled[:, None], weight @ motion_m[active], motion_m[active]))
+        pooling = Pooling(active, pooled, weight, lagged, elapsed_s[active])
+        motion_m = pooling.mean(motion_m)
         own = increment_m[:, active]
         increment_m = increment_m.at[:, active].set(jnp.where(pooled[None], own @ weight.T, own))
 
@@ -139,7 +147,7 @@ class TravellingTogether(eqx.Module):
             found,
             (increment_m, displacement_m, after.life_s, source),
         )
-        return after, found, Pooling(active, pooled, weight)
+        return after, found, pooling
 
     def heal(
         self, pooling: Pooling, log_likelihood: Float[Array, "tag segment"], dt_s: Float[Array, ""]
