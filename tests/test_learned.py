@@ -60,7 +60,7 @@ def test_default_is_what_was_learned_from_these_settings(tmp_path: Path, monkeyp
         chosen, named = (load_parameters(tracer, source, settings) for source in ("default", name))
         assert chosen.physical() == named.physical()
     with pytest.raises(ValueError, match=r"no packaged parameters were learned from these settings.*one, two"):
-        load_parameters(tracer, "default", {**SETTINGS, "detection": {"threshold": 0.4}})
+        load_parameters(tracer, "default", {**SETTINGS, "detection": {"threshold": 0.3}})
 
 
 def test_settings_that_learned_parameters_replace_are_refused(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_settings_that_learned_parameters_replace_are_refused(tmp_path: Path) ->
     tracer = TagAttention(whole=None)
     with pytest.raises(ValueError, match=r"found tracer\.dwell\.memory_s=2\.0; expected 4\.0"):
         load_parameters(tracer, path, {**SETTINGS, "dwell": {"memory_s": 2.0}})
-    other = {**SETTINGS, "detection": {"threshold": 0.4}, "hidden": None}  # which are not learned
+    other = {**SETTINGS, "detection": {"threshold": 0.3}, "hidden": None}  # which are not learned
     with pytest.raises(
         ValueError, match=r"found tracer\.hidden=null, .*; expected tracer\.hidden=not null, .*Set the expected values"
     ):

@@ -60,7 +60,7 @@ class DwellState(eqx.Module):
         """The state with this evidence."""
         return eqx.tree_at(lambda one: one.log_likelihood, self, log_likelihood)
 
-    def of_tags(self) -> list[Array]:
+    def of_tags(self) -> list[Any]:
         """The arrays with one row a tag."""
         return [self.real, self.imaginary, self.read_m, self.channel, self.log_likelihood]
 

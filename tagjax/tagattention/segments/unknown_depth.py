@@ -7,6 +7,8 @@ by a Kalman filter (`depth_filter`), and adds up each one's likelihood. Slot 0, 
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -56,7 +58,7 @@ class UnknownDepthState(eqx.Module):
             lambda s: (s.log_hypothesis, s.log_likelihood), self, (self.log_hypothesis + more, log_likelihood)
         )
 
-    def of_tags(self) -> list[Array]:
+    def of_tags(self) -> list[Any]:
         """The arrays with one row a tag."""
         tables = self.belief.mean, self.belief.covariance, self.log_hypothesis, self.log_likelihood
         return [*tables, self.seen, self.channel, self.carrier_hz]
