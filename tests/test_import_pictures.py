@@ -278,7 +278,7 @@ def test_damaged_pictures_and_other_sizes_stop_the_import_and_leave_nothing(fold
 def test_names_and_lists_that_give_no_time_are_refused(folder):
     first = min((folder / "colour").iterdir())
     first.rename(folder / "colour" / "first.png")
-    with pytest.raises(RecordingError, match=r"first\.png: the name is no time"):
+    with pytest.raises(RecordingError, match=r"first\.png names no time"):
         _import(folder)
     (folder / "colour" / "first.png").rename(folder / "colour" / f"{TIMES[1]}.png")
     with pytest.raises(RecordingError, match="have one time"):

@@ -159,4 +159,4 @@ def test_only_frames_and_reads_enter(clip):
     assert clip.frames.objects is None
     givers = {path.name for path in Path(tagjax.__file__).parent.rglob("*.py") if "frames.objects" in path.read_text()}
     assert givers == {"objects.py"}
-    assert {"labels", "evidence", "recent", "body", "member"} == set(Hindsight.__dataclass_fields__)
+    assert {"labels", "evidence", "recent", "free_nats", "body", "member"} == set(Hindsight.__dataclass_fields__)

@@ -65,7 +65,10 @@ LEARNED = {
         *("extent", "moving_m_s", "memory_s"),
     },
     "hidden": {"margin_nats", "reach_m", "drift_m_s", "stop_s"},
-    "detection": {"temperature_nats", "stationary", "elsewhere", "fresh_s"},
+    "detection": {
+        *("temperature_nats", "stationary", "free", "free_recent", "level"),
+        *("moves_nats", "moves_level", "fresh_s"),
+    },
 }
 UNSEEN = {
     *("hidden.drift_m_s", "hidden.stop_s"),  # nothing is hidden in the scene
@@ -104,7 +107,7 @@ def test_exactly_the_named_parameters_are_learned() -> None:
     static = static_settings(tracer)
     assert static["segments.background.confirm_s"] == 1.5
     assert static["body.rigid.lags_s"] == [0.17, 0.33, 0.67]
-    assert static["detection.threshold"] == 0.5
+    assert static["detection.threshold"] == 0.4
     assert static["attention"] is None
     assert not set(static) & names
 
@@ -258,9 +261,9 @@ def test_other_settings_than_those_of_the_training_are_refused(
 def test_a_parameter_that_learning_left_unchanged_may_have_any_value(tmp_path: Path) -> None:
     path = tmp_path / "weights.json"
     save_parameters(path, TagAttention(), CONF, {})
-    found = make_tracer(_changed(CONF, "detection.elsewhere", -3.0), str(path))
+    found = make_tracer(_changed(CONF, "detection.level", -3.0), str(path))
     assert isinstance(found, TagAttention)
-    assert found.physical()["detection.elsewhere"] == -3.0
+    assert found.physical()["detection.level"] == -3.0
 
 
 def test_the_weights_of_another_tracer_are_refused(tmp_path: Path) -> None:
