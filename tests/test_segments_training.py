@@ -147,7 +147,7 @@ def test_parameters_have_the_gradients_of_central_differences(clip, cut: bool, m
         assert set(every_term.weights()) == set(TERM_NAMES)
         gradient, logged = clip_gradient(tracer, camera, frames, KEY, every_term)
         assert np.isfinite(float(logged["loss"]))
-        for name in (*names, "detection.free"):
+        for name in (*names, "detection.level"):
             of = operator.attrgetter(name)
             leaf = lambda m, of=of: getattr(of(m), "unconstrained", of(m))  # noqa: E731
             ends = [eqx.tree_at(leaf, tracer, leaf(tracer) + step) for step in (1e-6, -1e-6)]
