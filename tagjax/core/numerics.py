@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Shaped
@@ -64,10 +67,10 @@ def cos_sin(angle_rad: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], 
     return 1.0 - 2.0 * sin * sin, 2.0 * sin * cos
 
 
-def squared_distance(one: Float[Array, "one 3"], other: Float[Array, "other 3"]) -> Float[Array, "one other"]:
+def squared_distance(one: Float[Array, "one axis"], other: Float[Array, "other axis"]) -> Float[Array, "one other"]:
     """Of each point to each. Axis by axis: XLA sums over a last axis of three several times as slowly on a CPU."""
-    x, y, z = (jnp.square(own[:, None] - their[None]) for own, their in zip(one.T, other.T, strict=True))
-    return x + y + z
+    along = (jnp.square(own[:, None] - their[None]) for own, their in zip(one.T, other.T, strict=True))
+    return functools.reduce(operator.add, along)
 
 
 def log_i0(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

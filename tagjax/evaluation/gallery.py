@@ -13,10 +13,9 @@ from jaxtyping import UInt8
 from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError
 from ..recording.image_files import write_image
+from ..recording.suite_folder import SPLITS
 from .picture import frame_overlay
 from .traced import Traced, TracedConfig
-
-SPLITS = ("train", "validation", "test")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

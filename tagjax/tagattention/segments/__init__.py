@@ -1,5 +1,6 @@
 """The tracer on segments: persistent segments that follow the flow, evidence of the reads, and the body that carries a tag."""
 
+from .association import SegmentTrace as SegmentTrace
 from .background import Background as Background
 from .body import Bodies as Bodies
 from .body import CarryingBody as CarryingBody
@@ -11,7 +12,6 @@ from .rigid import RigidMotion as RigidMotion
 from .step import SegmentFrame as SegmentFrame
 from .step import SegmentTracker as SegmentTracker
 from .step import SegmentTrackerState as SegmentTrackerState
-from .tracer import SegmentTrace as SegmentTrace
 from .tracer import TagAttention as TagAttention
 from .tracer import TagAttentionState as TagAttentionState
 from .travel import Pooling as Pooling

@@ -156,7 +156,7 @@ class CarryingBody(eqx.Module):
         if later is not None:
             fastest_m_s = jnp.where(behind, 0.0, jnp.maximum(own_m_s, later.fastest_m_s))
             memories.append(later.membership)
-        exists = (area > 0) & (jnp.arange(num_segments) > 0)
+        exists = found.in_view
         rank = jnp.where(exists, fastest_m_s + 0.1 * jnp.max(sum(memories), axis=0, initial=0.0), -jnp.inf)
         _, active = jax.lax.top_k(jax.lax.stop_gradient(rank), min(self.num_active, num_segments))
         there = exists[active]

@@ -10,6 +10,7 @@ background: a tag that stays in place.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -31,6 +32,7 @@ _FEW_ROWS = 16  # tags times antennas, of which all slots are as soon copied
 
 _Rows = tuple[Array, Array, Array]
 ReadsT = TypeVar("ReadsT", bound=tuple[Any, ...])
+CarryT = TypeVar("CarryT")
 
 
 class DwellState(eqx.Module):
@@ -135,8 +137,14 @@ def inherited(
     A segment from slot 0 or from nowhere was at rest there, or it comes into view: through a door, from behind something.
     What it did before is then unknown, so reads of that time say nothing against it. Evidence for a tag at rest is kept.
     """
-    unknown = (newborn_source > NOT_NEW) & (newborn_source <= STATIC) & (jnp.arange(len(newborn_source)) != STATIC)
+    unknown = past_unknown(newborn_source)
     return jnp.where(unknown[None], jnp.maximum(log_likelihood, 0.0), log_likelihood)
+
+
+def past_unknown(newborn_source: Int[Array, " segment"]) -> Bool[Array, " segment"]:
+    """The new segments that come from slot 0 or from nowhere."""
+    slot = jnp.arange(len(newborn_source))
+    return (newborn_source > NOT_NEW) & (newborn_source <= STATIC) & (slot != STATIC)
 
 
 def _of_sources(tables: _Rows, newborn_source: Int[Array, " segment"]) -> _Rows:
@@ -174,6 +182,15 @@ def in_chunks(reads: ReadsT) -> ReadsT:
     """(chunk, _CHUNK) reads, the first of which are `Arrivals`, with invalid ones at the end: a chunk of such reads costs nothing."""
     more = -reads[0].valid.shape[0] % _CHUNK
     return jax.tree.map(lambda leaf: jnp.pad(leaf, (0, more)).reshape(-1, _CHUNK), reads)
+
+
+def over_chunks(add: Callable[[CarryT, Any], tuple[CarryT, None]], begin: CarryT, chunks: tuple[Any, ...]) -> CarryT:
+    """What `add`, a step of a scan, makes of `begin` over all reads, which are `in_chunks`."""
+
+    def add_chunk(carry: CarryT, chunk: Any) -> tuple[CarryT, None]:
+        return jax.lax.cond(jnp.any(chunk[0].valid), lambda: jax.lax.scan(add, carry, chunk)[0], lambda: carry), None
+
+    return jax.lax.scan(add_chunk, begin, chunks)[0]
 
 
 def _after_reads(
@@ -234,10 +251,7 @@ def _block_after_reads(
         put = [_put_row(table, at, slots, row) for table, row in zip(tables, own, strict=True)]
         return (*put, _put_row(log_likelihood, read.tag, slots, of_tag)), None
 
-    def add_chunk(rows: Any, chunk: tuple[Arrivals, Array, Array, Array]) -> tuple[Any, None]:
-        return jax.lax.cond(jnp.any(chunk[0].valid), lambda: jax.lax.scan(add, rows, chunk)[0], lambda: rows), None
-
-    return jax.lax.scan(add_chunk, rows, reads)[0]
+    return over_chunks(add, rows, reads)
 
 
 def _taken(rows: Shaped[Array, "*batch segment"], slots: Int[Array, " some"]) -> Shaped[Array, "*batch some"]:

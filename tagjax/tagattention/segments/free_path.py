@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from ...core.parameters import check_positive
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
-from .dwell import in_chunks
+from .dwell import in_chunks, over_chunks
 
 _SHORTEST_WALK_M_S = 1e-3  # far below the spacing of speeds: they stay what they are
 _DEPTH_M = 2.0  # errors of the motion count as those of a body at this depth do
@@ -115,11 +115,7 @@ class FreePath(eqx.Module):
             own = jax.checkpoint(add, prevent_cse=False)
             return jax.lax.cond(one[0].valid, own, lambda carry, _: carry, carry, one), None
 
-        def add_chunk(carry: tuple[FreePathState, Array], chunk: tuple[Arrivals, Array]) -> tuple[tuple, None]:
-            some = jnp.any(chunk[0].valid)
-            return jax.lax.cond(some, lambda: jax.lax.scan(add_valid, carry, chunk)[0], lambda: carry), None
-
         begin = state, jnp.zeros_like(state.log_likelihood)
-        (after, added), _ = jax.lax.scan(add_chunk, begin, in_chunks((arrivals, fresh)))
+        after, added = over_chunks(add_valid, begin, in_chunks((arrivals, fresh)))
         kept = jnp.exp(-(now_s - since_s) / memory_s)
         return eqx.tree_at(lambda one: one.log_likelihood, after, kept * state.log_likelihood + added), added

@@ -12,7 +12,7 @@ from .background import Background, BackgroundState, BackgroundView
 from .carry import on_surface
 from .cells import NO_LABEL
 from .increments import segment_motion
-from .labels import Labelling, Segmenter, SegmentState
+from .labels import STATIC, Labelling, Segmenter, SegmentState
 
 
 class SegmentFrame(eqx.Module):
@@ -37,6 +37,11 @@ class SegmentFrame(eqx.Module):
     background_lost: Float[
         Array, "*time"
     ]  # fraction of the confirmed background that shows another depth: near 1, the camera moved
+
+    @property
+    def in_view(self) -> Bool[Array, " segment"]:
+        """Of one frame: the segments that it shows, without the static background."""
+        return (self.area > 0) & (jnp.arange(self.area.shape[0]) != STATIC)
 
 
 class SegmentTrackerState(eqx.Module):

@@ -21,14 +21,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Int8
+from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import named_values, with_named_values
 from ...core.numerics import safe_divide
 from ...radio.arrivals import Arrivals
 from ...radio.reader_model import ReaderModel
 from ...tracing.status import Status
-from ...tracing.tracer import AbstractSmoother, Camera, Evidence, Frame, Trace
+from ...tracing.tracer import AbstractSmoother, Camera, Frame, Trace
+from .association import Association, SegmentTrace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody, LaterBody
 from .cut import cut_segments
@@ -55,47 +56,6 @@ from .whole import WholeBody
 
 CAMERA_MOVED_FRACTION = 0.8
 """Of the static background that shows another depth, in two frames: the camera moved. People in front of it cover less."""
-
-
-class Association(eqx.Module):
-    """Each tag's body among the segments of a frame."""
-
-    membership: Float[Array, "tag segment"]  # probability that a segment belongs to the tag's body
-    centre_m: Float[Array, "tag 3"]
-    step_m: Float[Array, "tag antenna"]  # change of the body's range since the last frame
-    body_nats: Float[
-        Array, " tag"
-    ]  # evidence of the reads that the tag moves with the body, against phases at random; 0 without
-    stationary_nats: Float[Array, " tag"]  # ... that it is stationary
-    free_nats: Float[Array, " tag"]  # ... that it moves on a path of its own; 0 without the stage
-    recent: RecentReads
-    confidence: Float[Array, " tag"]
-    detected: Bool[Array, " tag"]
-    status: Int8[Array, " tag"]  # codes of `Status`
-    best_nats: Float[Array, " tag"]  # evidence for the segment that explains the reads best; 0 without a segment
-
-    def evidence(self) -> Evidence:
-        """The evidence for each explanation that `Detection` compares, and for the best segment."""
-        return Evidence(
-            body=self.body_nats,
-            stationary=self.stationary_nats,
-            free=self.free_nats,
-            best_segment=self.best_nats,
-        )
-
-
-class SegmentTrace(eqx.Module):
-    """The output for one frame, for every tag, on segments; `TagAttention.step` makes dense masks of it."""
-
-    labels: Int[Array, "height width"]  # slot of each pixel, -1 = none
-    box_px: Float[Array, "tag 4"]
-    centre_px: Float[Array, "tag 2"]
-    tags: Association
-
-
-def moving_segments(area: Float[Array, " segment"]) -> Bool[Array, " segment"]:
-    """The segments that are in view and not the static background."""
-    return (area > 0) & (jnp.arange(area.shape[0]) != STATIC)
 
 
 class TagAttention(AbstractSmoother):
@@ -295,14 +255,11 @@ class TagAttention(AbstractSmoother):
             membership=membership,
             centre_m=centre_m,
             step_m=mean(found.increment_m.T),
-            body_nats=body_nats,
-            stationary_nats=nats.stationary,
-            free_nats=nats.free,
-            recent=around,
+            nats=nats,
             confidence=confidence,
             detected=detected,
             status=jnp.where(frame.present, status, jnp.int8(Status.UNKNOWN)),
-            best_nats=best_of_segments(evidence, moving_segments(found.area)),
+            best_nats=best_of_segments(evidence, found.in_view),
         )
 
     def _evidence(
@@ -388,7 +345,7 @@ class TagAttention(AbstractSmoother):
     ) -> tuple[BodyState | None, Float[Array, "tag segment"], Float[Array, "tag segment"]]:
         """The state of the bodies, the probability that each segment belongs to each tag's, and that of the tag's place."""
         if self.body is None or state is None:
-            membership = cut_segments(log_likelihood, moving_segments(found.area))
+            membership = cut_segments(log_likelihood, found.in_view)
             return None, membership, membership * found.area[None]
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
         state, bodies = self.body.step(state, evidence, found, since_s, now_s, later)

@@ -112,7 +112,6 @@ class TravellingTogether(eqx.Module):
         increment_m, motion_m, known, centre_m = found.increment_m, found.motion_m, found.known, found.centre_m
         area, source = found.area, found.source
         num_segments, dt_s = area.shape[0], now_s - since_s
-        exists = (area > 0) & (jnp.arange(num_segments) > 0)
         newborn = source > -2
         moved_m = jnp.where(newborn[:, None], 0.0, motion_m)
         before = _inherit(state, source)
@@ -121,10 +120,10 @@ class TravellingTogether(eqx.Module):
         )
         speed = safe_norm(lagged_m) / jnp.maximum(elapsed_s, _SHORTEST_S)
         num_active = min(self.num_active, num_segments)
-        fastest, active = jax.lax.top_k(jax.lax.stop_gradient(jnp.where(exists, speed, -1.0)), num_active)
+        fastest, active = jax.lax.top_k(jax.lax.stop_gradient(jnp.where(found.in_view, speed, -1.0)), num_active)
         there = fastest >= 0
         source = self._adopted(
-            source, centre_m, jnp.where(exists, area, 0.0), active, there & (fastest > 0), newborn, speed
+            source, centre_m, jnp.where(found.in_view, area, 0.0), active, there & (fastest > 0), newborn, speed
         )
 
         centre, lagged = centre_m[active], lagged_m[active]

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ...core.constrained import Positive
-from ...core.numerics import safe_norm
+from ...core.numerics import safe_norm, squared_distance
 from ...core.parameters import check_positive
 from ...radio.arrivals import Arrivals
 from ...radio.phase import distance_to_phase
 from ...radio.reader_model import ReaderModel
-from .cells import NOT_NEW, row_sources
+from .cells import row_sources
 from .depth_filter import (
     DepthBelief,
     moved,
@@ -32,6 +32,7 @@ from .depth_filter import (
     with_rate,
     with_read,
 )
+from .dwell import in_chunks, over_chunks, past_unknown
 from .labels import STATIC
 from .step import SegmentFrame
 from .travel import Pooling
@@ -222,12 +223,13 @@ class UnknownDepth(eqx.Module):
                 evidence.at[at].add(jnp.where(new, 0.0, fresh * nats)),
             )
 
-        def add(carry, one: Arrivals):
-            return jax.lax.cond(one.valid, lambda: updated(carry, one), lambda: carry), None
+        def add(carry, reads: tuple[Arrivals]):
+            return jax.lax.cond(reads[0].valid, lambda: updated(carry, *reads), lambda: carry), None
 
         times = jnp.broadcast_to(since_s, state.channel.shape)
         begin = belief, state.seen, state.channel, state.carrier_hz, times, log_hypothesis
-        (belief, seen, channel, carrier_hz, times, log_hypothesis), _ = jax.lax.scan(add, begin, arrivals)
+        after = over_chunks(add, begin, in_chunks((arrivals,)))
+        belief, seen, channel, carrier_hz, times, log_hypothesis = after
         belief = jax.vmap(gone_on, in_axes=(0, 0, 0, None))(belief, carrier_hz, times, now_s)
         log_likelihood = jax.nn.logsumexp(log_hypothesis, axis=1) - float(np.log(self.num_depths))
         after = UnknownDepthState(belief, log_hypothesis, log_likelihood, fastest, seen, channel, carrier_hz)
@@ -254,8 +256,8 @@ class UnknownDepth(eqx.Module):
         turned = RayMotion.of(found.centre_m[at], pooling.lagged_m).turn
         length = safe_norm(turned)
         further = jnp.maximum(length[:, None], length[None])
-        near = _apart(ray) / jnp.square(self.scale_reach.value)
-        alike = _apart(turned) / jnp.square(0.002 + 0.3 * further)
+        near = squared_distance(ray, ray) / jnp.square(self.scale_reach.value)
+        alike = squared_distance(turned, turned) / jnp.square(0.002 + 0.3 * further)
         whole = elapsed_s > 0.8 * jnp.max(elapsed_s)
         size = jnp.where(whole & (found.area[at] > 0), found.area[at], 0.0)
         weight = jnp.exp(-0.5 * (near + alike)) * size[None]
@@ -299,7 +301,7 @@ class UnknownDepth(eqx.Module):
         """The state with new segments' rows: a tag that was at rest until now has a known phase, and any depth."""
         source = row_sources(newborn_source)
         of_sources = lambda table: jnp.take(table, source, axis=-1)  # noqa: E731
-        fresh = (newborn_source > NOT_NEW) & (newborn_source <= STATIC) & (jnp.arange(source.shape[0]) != STATIC)
+        fresh = past_unknown(newborn_source)
         log_depth, std = self._depths()
         mean, covariance = of_sources(state.belief.mean), of_sources(state.belief.covariance)
         begun = covariance.at[:, :2].set(0.0).at[:, :, :2].set(0.0).at[:, 0, 0].set(jnp.square(std))
@@ -314,9 +316,3 @@ class UnknownDepth(eqx.Module):
             state,
             (belief, jnp.where(rows, unknown, evidence), jnp.where(fresh, 0.0, state.fastest[source])),
         )
-
-
-def _apart(rays: Float[Array, "active 2"]) -> Float[Array, "active active"]:
-    """The squared distance of each two rays."""
-    x, y = rays.T
-    return jnp.square(x[:, None] - x[None]) + jnp.square(y[:, None] - y[None])

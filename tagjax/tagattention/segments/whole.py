@@ -60,7 +60,7 @@ class WholeBody(eqx.Module):
         segment has not travelled yet.
         """
         num_segments = found.area.shape[0]
-        exists = (found.area > 0) & (jnp.arange(num_segments) > 0)
+        exists = found.in_view
         speed_m_s = safe_norm(moved_m) / jnp.maximum(elapsed_s, self.lag_s)
         limit_m_s = self.travel_m_s.value
         travels = jnp.where(exists, jax.nn.sigmoid((speed_m_s - limit_m_s) / (0.2 * limit_m_s)), 0.0)
