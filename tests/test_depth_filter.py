@@ -51,11 +51,11 @@ def test_a_step_is_that_of_a_dense_filter() -> None:
     before, after = np.array([3.0, 4.0, 5.0]), np.array([3.4, 3.8, 5.1])
     slopes = np.array([50.0, 40.0, 45.0]), np.array([51.0, 38.0, 45.0])
     dt, std, settle, noise = 0.02, 0.5, 0.3, np.array([0.01, 0.02, 0.03])
-    ranges = [
+    last, now = (
         Ranges(jnp.asarray(p, jnp.float32)[:, None], jnp.asarray(s, jnp.float32)[:, None])
         for p, s in zip((before, after), slopes, strict=True)
-    ]
-    got = moved(belief, *ranges, jnp.array(dt), jnp.asarray(noise, jnp.float32)[:, None])
+    )
+    got = moved(belief, last, now, jnp.array(dt), jnp.asarray(noise, jnp.float32)[:, None])
     got = settled(got, jnp.array(dt), jnp.array([std]), jnp.array(settle))
     kept = np.exp(-dt / settle)
     first = np.eye(2 + NUM)

@@ -67,7 +67,7 @@ def test_still_pixels_are_averaged_and_moving_ones_are_not() -> None:
     frames, square = _noisy(9)
     now = steady_mean(list(frames))
     scene = np.random.default_rng(2).uniform(40, 120, (HEIGHT, WIDTH, 3))
-    still = ~square.any(axis=0)
+    still = np.logical_not(square.any(axis=0))
     still[10:26] = False  # away from the square by more than the windows
     assert np.std((now - scene)[still]) < 0.55 * 2  # 1/3 but for pixels whose noise looks like a change
     # Nowhere is the square's last place, or where it has just been, mixed with what was seen there before.

@@ -172,4 +172,12 @@ def trace_from_detections(detections: Sequence[Detection | None], shape: tuple[i
         confidence[tag], found[tag] = detection.confidence, True
     # Masks are large and read on the host: they stay there even if an accelerator is the default device.
     with jax.default_device(jax.devices("cpu")[0]):
-        return Trace(*(jnp.asarray(x) for x in (mask, box, centre, position, step[:, None], confidence, found)))
+        return Trace(
+            mask=jnp.asarray(mask),
+            box_px=jnp.asarray(box),
+            centre_px=jnp.asarray(centre),
+            centre_m=jnp.asarray(position),
+            step_m=jnp.asarray(step[:, None]),
+            confidence=jnp.asarray(confidence),
+            detected=jnp.asarray(found),
+        )
