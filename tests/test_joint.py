@@ -175,6 +175,7 @@ def test_a_joint_run_learns_both_resumes_exactly_and_is_evaluated_with_its_own_f
             "optimizer": {"_target_": "optax.adam", "learning_rate": 1e-3},
             "init": None,
         },
+        "objective": {},
         "data": {
             "recordings": paths[:1],
             "validation": paths[1:],
