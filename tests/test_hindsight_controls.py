@@ -26,7 +26,7 @@ from tagjax.training.hindsight.control import control_of, control_reads
 from tagjax.training.hindsight.objective import control_sums, hindsight_sums
 from tagjax.training.hindsight.pieces import frame_of
 
-SETTINGS = HindsightSettings(memory=1.0, controls=0.25)
+SETTINGS = HindsightSettings(memory=1.0, learn="confidence", controls=0.25)
 _sums = eqx.filter_jit(control_sums)
 
 
@@ -109,13 +109,12 @@ def test_the_loss_of_a_control_is_the_mean_square_of_its_confidence(piece: Piece
 @pytest.mark.ci
 def test_controls_count_as_the_fraction_of_reads_that_belong_to_nothing(piece: Piece) -> None:
     found = _sums(TRACER, piece.camera, piece.frames, SETTINGS)
-    alone = dataclasses.replace(SETTINGS, stages="detection")
     silent = dataclasses.replace(piece.frames, present=jnp.zeros_like(piece.frames.present))  # no own frame counts
-    loss, logged = eqx.filter_jit(alone.terms)(TRACER, piece.camera, silent)
+    loss, logged = eqx.filter_jit(SETTINGS.terms)(TRACER, piece.camera, silent)
     np.testing.assert_allclose(loss["hindsight"], found.wrong / 80 / 3, rtol=1e-4)  # 1 of 4 to 3 of 4
     np.testing.assert_allclose(logged["false_confidence/control"], found.claimed / 80, rtol=1e-4)
     bare = dataclasses.replace(piece.frames, control=None)
-    _, fewer = eqx.filter_eval_shape(alone.terms, TRACER, piece.camera, bare)
+    _, fewer = eqx.filter_eval_shape(SETTINGS.terms, TRACER, piece.camera, bare)
     assert set(fewer) == {"overlap", "false_confidence"}
 
 
@@ -134,22 +133,19 @@ def test_a_control_teaches_detection_its_true_slope_and_nothing_else(piece: Piec
 
 
 @pytest.mark.ci
-def test_detection_alone_learns_what_it_learns_among_all_stages(piece: Piece) -> None:
+def test_detection_has_the_slope_that_the_whole_tracer_gives_it(piece: Piece) -> None:
     learnable, static = eqx.partition(TRACER, eqx.is_inexact_array)
 
     def slopes(settings: HindsightSettings) -> Any:
-        def sums(values: Any) -> Any:
-            found = hindsight_sums(eqx.combine(values, static), piece.camera, piece.frames, settings)
-            return jnp.stack([found.missed, found.wrong])
+        def wrong(values: Any) -> Any:
+            return hindsight_sums(eqx.combine(values, static), piece.camera, piece.frames, settings).wrong
 
-        return jax.jit(jax.jacrev(sums))(learnable)
+        return jax.jit(jax.grad(wrong))(learnable)
 
-    faint = HindsightSettings(memory=0.9)
-    together, alone = slopes(faint), slopes(dataclasses.replace(faint, stages="detection"))
-    for one, other in zip(jax.tree.leaves(together.detection), jax.tree.leaves(alone.detection), strict=True):
+    alone = dataclasses.replace(SETTINGS, memory=0.9)
+    through_all = slopes(dataclasses.replace(alone, learn="masks"))  # also differentiates what detection is given
+    for one, other in zip(*(jax.tree.leaves(each.detection) for each in (through_all, slopes(alone))), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
-    others = eqx.tree_at(lambda one: one.detection, alone, None)
-    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(others))
 
 
 def test_files_hold_the_controls_and_are_the_same_each_time(piece: Piece, tmp_path: Path) -> None:
@@ -175,10 +171,10 @@ def test_files_hold_the_controls_and_are_the_same_each_time(piece: Piece, tmp_pa
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"hindsight": {"stages": "body"}}, r"hindsight\.stages: found 'body'; expected one of 'all', 'detection'"),
+        ({"hindsight": {"learn": "body"}}, r"hindsight\.learn: found 'body'; expected one of 'masks', 'confidence'"),
         ({"hindsight": {"controls": 1.0}}, r"hindsight: controls is 1\.0; expected a fraction from 0 to 1, 1 excluded"),
         (
-            {"data": {"control": "shifted"}},
+            {"data": {"control": "shifted"}, "hindsight": {"learn": "confidence"}},
             r"data\.control is shifted and hindsight\.controls is 0\.1; expected one of them",
         ),
     ],
@@ -188,7 +184,13 @@ def test_settings_that_cannot_be_used_are_refused(given: dict[str, Any], message
         from_mapping(TrainConfig, {**LEAST, **given})
 
 
-def test_a_run_on_controls_has_none_of_its_own() -> None:
-    given = {"data": {"control": "foreign"}, "hindsight": {"controls": 0.0}}
-    config = from_mapping(TrainConfig, {**LEAST, **given})
-    assert config.hindsight == HindsightSettings(controls=0.0)
+def test_only_the_confidence_has_controls_and_a_run_on_controls_may_have_none() -> None:
+    foreign = {"data": {"control": "foreign"}}
+    masks = from_mapping(TrainConfig, {**LEAST, **foreign}).learned
+    assert isinstance(masks, HindsightSettings)
+    assert not masks.needs_controls
+    without = {"hindsight": {"learn": "confidence", "controls": 0.0}}
+    assert from_mapping(TrainConfig, {**LEAST, **foreign, **without}).hindsight == HindsightSettings(
+        learn="confidence", controls=0.0
+    )
+    assert HindsightSettings(learn="confidence").needs_controls

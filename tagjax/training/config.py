@@ -49,7 +49,11 @@ class TrainConfig:
             raise ConfigError(
                 "joint is on, and learning from hindsight does not reach the flow; expected experiment=clips with it."
             )
-        if self.data.control is not None and isinstance(self.learned, HindsightSettings) and self.learned.controls:
+        if (
+            self.data.control is not None
+            and isinstance(self.learned, HindsightSettings)
+            and self.learned.needs_controls
+        ):
             raise ConfigError(
                 f"data.control is {self.data.control} and hindsight.controls is {self.learned.controls}; expected one of them: "
                 "reads that are exchanged twice may belong to what is seen. Set hindsight.controls=0."

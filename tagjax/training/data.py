@@ -104,7 +104,7 @@ def _pieces(
                 epcs=config.data.clips.epcs,
                 num_frames=settings.piece_frames,
                 teacher=settings.teacher,
-                controls=settings.controls > 0,
+                controls=settings.needs_controls,
                 on_progress=report,
             )
     files, sure = found["training"], found["training"].num_sure(settings)

@@ -14,14 +14,13 @@ from jaxtyping import Array, Float, PyTree
 
 from ...core.numerics import safe_divide
 from ...core.settings import ConfigError
-from ...tagattention.segments import Detection, TagAttention
-from ...tagattention.segments.detection import Explanations, RecentReads
+from ...tagattention.segments import TagAttention
 from ...tracing.tracer import AbstractTracer, Camera
 from ..fading import faded
 from .pieces import PieceFrames, frame_of
 from .teachers import Teacher
 
-_RIGHT = 0.5  # IoU above which a mask counts as right
+_RIGHT = 0.3  # IoU above which a mask counts as right
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +34,8 @@ class HindsightSettings:
     clip_norm: float = 0.3  # of a piece's gradient, at most: some have 50 times the median
     piece_frames: int = 256  # a recording is cut into pieces of at most so many frames
     teacher: Teacher = "smoother"  # or labels: the true masks of simulated recordings, to compare with
-    controls: float = 0.1  # fraction of reads taken to belong to nothing in view, which teach what is false; 0: none
-    stages: Literal["all", "detection"] = "all"  # that learn; detection alone needs no backward pass through the others
+    learn: Literal["masks", "confidence"] = "masks"  # masks: all stages but detection; confidence: detection alone
+    controls: float = 0.1  # of the confidence: fraction of reads taken to belong to nothing in view; 0: none
     term_norms: ClassVar[bool] = False  # there is one term
 
     def __post_init__(self) -> None:
@@ -50,6 +49,11 @@ class HindsightSettings:
             raise ConfigError(f"piece_frames is {self.piece_frames}; expected at least 1 frame.")
         if not 0 <= self.controls < 1:
             raise ConfigError(f"controls is {self.controls}; expected a fraction from 0 to 1, 1 excluded.")
+
+    @property
+    def needs_controls(self) -> bool:
+        """Whether control reads take part."""
+        return self.learn == "confidence" and self.controls > 0
 
     def weights(self) -> dict[str, float]:
         """The weight of each term."""
@@ -66,7 +70,10 @@ class HindsightSettings:
         """The loss of a piece, and what it consists of."""
         assert isinstance(tracer, TagAttention)
         sums = hindsight_sums(tracer, camera, frames, self)
-        loss = safe_divide(sums.missed, sums.num_there) + safe_divide(sums.wrong, sums.num_there + sums.num_away)
+        if self.learn == "masks":
+            loss = safe_divide(sums.missed, sums.num_there)
+        else:
+            loss = safe_divide(sums.wrong, sums.num_there + sums.num_away)
         logged = {
             "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
             "false_confidence": safe_divide(sums.claimed, sums.num_away),
@@ -82,7 +89,7 @@ class HindsightSums(NamedTuple):
     """Sums over the tag-frames of which the teacher is sure, and their numbers."""
 
     missed: Float[Array, ""]  # 1 - IoU where the teacher sees the object
-    wrong: Float[Array, ""]  # (confidence - 1)^2 where the IoU is above one half, confidence^2 elsewhere
+    wrong: Float[Array, ""]  # (confidence - 1)^2 where the mask is right, confidence^2 elsewhere
     claimed: Float[Array, ""]  # confidence where it sees nothing
     num_there: Float[Array, ""]
     num_away: Float[Array, ""]
@@ -96,38 +103,21 @@ class ControlSums(NamedTuple):
     num: Float[Array, ""]
 
 
-class _Apart(eqx.Module):
-    """A detection, to whose inputs no gradient flows."""
-
-    stage: Detection
-
-    def received(self, state: RecentReads, arrivals: Any, *given: Array) -> RecentReads:
-        return self.stage.received(state, arrivals, *jax.lax.stop_gradient(given))
-
-    def confidence(self, nats: Explanations, recent: RecentReads) -> Array:
-        return self.stage.confidence(jax.lax.stop_gradient(nats), recent)
-
-    def __getattr__(self, name: str) -> Any:  # of the status, which has no gradient
-        return getattr(self.stage, name)
-
-
 def hindsight_sums(
     tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings
 ) -> HindsightSums:
     """The two questions of each tag-frame: where the object is, and how sure one may be of it.
 
     IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should be
-    the probability that the mask is right, that is, of an IoU above one half: its squared error is least where it is (a
-    proper score; Brier, 1950). That carries no gradient to the mask, nor does what detection is given: so the mask teaches
-    every stage but detection, and the confidence teaches detection alone.
+    the probability that the mask is right, that is, of an IoU above 0.3: its squared error is least where it is (a
+    proper score; Brier, 1950). The mask does not depend on detection, so it teaches every other stage; the confidence teaches
+    detection alone.
     """
-    if settings.stages == "detection":
+    if settings.learn == "confidence":
         overlap, confidence, size = _of_detection(tracer, camera, frames, settings.memory)
     else:
-        apart = eqx.tree_at(lambda one: one.detection, tracer, replace_fn=_Apart)
-        overlap, confidence, size = _scanned(
-            apart, camera, frames, lambda state: faded(state, settings.memory), jax.checkpoint
-        )
+        before = lambda state: faded(state, settings.memory)  # noqa: E731
+        overlap, confidence, size = _scanned(tracer, camera, frames, before, jax.checkpoint)
     there = frames.present & (frames.confidence > settings.sure) & (size > 0)
     away = frames.present & (frames.confidence < 1.0 - settings.sure)
     right = jnp.where(there & (overlap > _RIGHT), 1.0, 0.0)
@@ -154,8 +144,7 @@ def _of_detection(
     tracer: TagAttention, camera: Camera, frames: PieceFrames, memory: float
 ) -> tuple[Array, Array, Array]:
     """`_scanned` with gradients of detection only: the backward pass goes through its recent reads, and traces nothing again."""
-    given, detection = jax.lax.stop_gradient(tracer), _Apart(tracer.detection)
-    tracer = eqx.tree_at(lambda one: one.detection, given, detection)
+    tracer = eqx.tree_at(lambda one: one.detection, jax.lax.stop_gradient(tracer), tracer.detection)
 
     def before(state: Any) -> Any:
         recent = faded(state.recent, memory)
