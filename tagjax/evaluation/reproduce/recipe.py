@@ -22,7 +22,10 @@ Split = Literal["train", "validation", "test"]
 COUNTS = ("num_recordings", "num_tags", "num_frames")
 """Measures that count the items over which a cell's scores are averaged."""
 
-SCORES = ("iou", "cle_px", "mask_j", "identification", "success", "locked", "p_fa")
+SCORES = (
+    *("iou", "cle_px", "mask_j", "identification", "success", "locked", "p_fa"),
+    *("clear_iou", "clear_identification", "carrier_iou"),
+)
 """Means that a column can show: scores of `tagjax.metrics.tags.Scores`, and `locked` (of all tags)."""
 
 MEASURES = (*SCORES, *COUNTS)
