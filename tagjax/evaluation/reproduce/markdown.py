@@ -112,6 +112,8 @@ def _number(measure: str, value: float | None, whole: Mapping[str, Any]) -> str:
 def _plain_number(measure: str, value: float) -> str:
     if measure == "cle_px":
         return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
+    if measure == "p_fa":  # small: hundredths would hide it
+        return f"{100 * value:.1f} %"
     return f"{value:.2f}"
 
 
