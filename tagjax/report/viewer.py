@@ -56,7 +56,7 @@ def log_recording(
     """Log every frame with its trace, frame by frame, to the file `out`, or to a viewer that is opened.
 
     `epcs` and `antennas` (counted from 1) are those of the traces. Times are seconds since the first frame. With `depth`
-    each frame has its depth as well, which viewers show as points in space; without it a file is a tenth of the size.
+    each frame has its depth as well, which viewers show as points in space; without it a file is much smaller.
     """
     rr = rerun()
     batches = None
