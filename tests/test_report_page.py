@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -12,8 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic_clips as synthetic
 from report_runs import NUM_FRAMES, report_run
 
+from tagjax.metrics.recordings import ScoreSettings, evaluate_recording
+from tagjax.report.overlay import short_name
 from tagjax.report.page import PAGE, pictures, write_page
 from tagjax.report.page.contents import read_contents
 from tagjax.report.page.html import element
@@ -32,6 +36,7 @@ from tagjax.report.page.states import (
     runs,
     worst_cases,
 )
+from tagjax.report.stages import MOST_NATS, STAGES, log_odds, stage_picture, write_stages
 from tagjax.report.video import VIDEO, read_video, smaller_video, video_writer
 
 ROOT = Path(__file__).parents[1]
@@ -81,6 +86,34 @@ def test_the_page_has_all_parts_and_needs_nothing_else(copy: Path) -> None:
     assert "python -m experiments.evaluate tracer=small" in parsed.text
     assert "tracer: small" in parsed.text
     assert page.stat().st_size < 6_000_000
+
+
+def test_soft_masks_are_shown_as_log_odds_and_beside_binary_ones_the_attention(tmp_path: Path) -> None:
+    scene = synthetic.recording(NUM_FRAMES)
+    settings = ScoreSettings(num_pictures=3)
+    result = evaluate_recording(synthetic.SmallTracer(), scene, synthetic.load, stride=1, settings=settings)
+    picture = stage_picture(result.pictures, synthetic.WINDOW - 1)
+    assert picture is not None
+    assert picture.soft_masks is not None
+    clip = synthetic.load(scene, picture.frame - synthetic.WINDOW + 1, picture.frame + 1, epcs=picture.epcs)
+
+    def stages(soft_masks: np.ndarray | None) -> list[str]:
+        shown = dataclasses.replace(picture, soft_masks=soft_masks)
+        write_stages(tmp_path, scene, shown, clip.camera, clip.frames)
+        return [one["title"] for one in json.loads((tmp_path / STAGES).read_text())["stages"]]
+
+    names = [short_name(epc) for epc in picture.epcs]
+    shared = ["colour", "depth", "optical flow", "change of distance to the antenna"]
+    assert stages(picture.soft_masks) == [*shared, *(f"log odds of {name}" for name in names), "masks"]
+    for binary in (np.round(picture.soft_masks), None):
+        assert stages(binary) == [*shared, *(f"attention of {name}" for name in names), "masks"]
+    found = log_odds(np.array([[0.0, 0.5, 1.0, 1e-9, 1.0 / (1.0 + np.exp(-2.0))]]))
+    np.testing.assert_allclose(found, [[np.nan, 0.0, MOST_NATS, -MOST_NATS, 2.0]], atol=1e-9)
+
+
+def test_short_names_of_different_tags_differ() -> None:
+    assert short_name("E28011000000000000000001") == "..000001"
+    assert short_name("label1-seed0") == "label1-seed0"
 
 
 def test_the_page_is_made_again_from_the_files_alone(copy: Path) -> None:

@@ -66,6 +66,12 @@ def test_an_equation_in_its_own_line_scrolls_and_keeps_its_backslashes() -> None
 
 
 @pytest.mark.ci
+def test_a_function_is_set_apart_from_its_letter() -> None:
+    assert '<mi>log</mi><mspace width="0.17em"/><msub><mi>I</mi>' in _converted("$\\log I_0$")
+    assert "<mspace" not in _converted("$\\log(x) + \\log_b(x) + \\max(x)$")
+
+
+@pytest.mark.ci
 @pytest.mark.parametrize("text", ["`$a$ and ${b}`", "5$ or 6$", "$ 5 and 6 $", "\\$a\\$", "US$5 and A$6"])
 def test_other_dollars_are_dollars(text: str) -> None:
     assert "<math" not in _converted(text)
@@ -142,6 +148,20 @@ def test_every_equation_is_shown(site: Path) -> None:
         assert "$" not in plain, page
     assert counts["concepts"] > 20
     assert counts["tracer"] > 20
+
+
+@pytest.mark.ci
+def test_the_font_that_comes_along_has_every_character_of_the_equations(site: Path) -> None:
+    from fontTools.ttLib import TTFont
+
+    font = TTFont(site / "site" / "math.woff")
+    assert "MATH" in font
+    known = {chr(code) for code in font.getBestCmap() or {}}
+    for page in PAGES:
+        equations = re.findall(r"<math.*?</math>", (site / f"{page}.html").read_text(), flags=re.DOTALL)
+        shown = set(html.unescape(re.sub(r"<[^>]*>", "", "".join(equations)))) - {"\n"}
+        assert shown - known == set(), page
+    assert "math.woff" in (site / "site" / "style.css").read_text()
 
 
 @pytest.mark.ci

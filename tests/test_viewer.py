@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import time
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +46,25 @@ def _logged(file: Path, entity: str) -> list[Any]:
     return sorted(rows, key=lambda row: row[0])
 
 
+def _num_chunks(file: Path, entity: str) -> int:
+    from rerun.chunk import RrdReader
+
+    return sum(one.entity_path == entity and not one.is_static for one in RrdReader(file).stream().to_chunks())
+
+
 def test_the_file_holds_reads_pictures_and_what_was_traced(path: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     done = []
     config = ViewConfig(recording=str(path), tracer=TRACER, clips=CLIPS)
-    out = view_recording(config, tmp_path, on_progress=lambda *one: done.append(one))
+
+    def progress(*one: Any) -> None:
+        done.append(one)
+        time.sleep(0.02)  # as a slow machine: a file's size must not depend on it
+
+    out = view_recording(config, tmp_path, on_progress=progress)
     assert out == tmp_path / f"{scene(40).name}.rrd"
     assert out.stat().st_size < 5e6
+    assert _num_chunks(out, f"/confidence/{next(iter(EPCS))}") == 1
     assert done == [("trace", 0, 40, "compiling"), *(("trace", number, 40) for number in range(1, 41))]
     traces = list(trace_recording(make_tracer(TRACER), scene(40), clip_loader(ClipSettings(**CLIPS)), epcs=list(EPCS)))
     for tag, epc in enumerate(EPCS):

@@ -34,8 +34,9 @@ _BAR, _PRIME = '<mo stretchy="false">&#x0007C;</mo>', "<mi>&#x02032;</mi>"
 _SET_CLOSER = {
     re.compile(_BAR): _BAR.replace("<mo", '<mo lspace="0" rspace="0"'),
     re.compile(f"<msup>(<mi>[^<]*</mi>){_PRIME}</msup>"): r'<mrow>\1<mo lspace="0" rspace="0">&#x02032;</mo></mrow>',
+    re.compile(r"(?<!<msub>)(?<!<msup>)(<mi>(?:log|exp)</mi>)(?=<m(?:i|sub|sup|row)>)"): r'\1<mspace width="0.17em"/>',
 }
-"""Bars as fences, which would be spaced like operators, and primes, which are raised already."""
+"""Bars as fences, which would be spaced like operators; primes, which are raised already; a space between a function and its letter."""
 
 _NUM_CHILDREN = {"mfrac": 2, "msub": 2, "msup": 2, "mover": 2, "munder": 2, "mroot": 2, "msubsup": 3, "munderover": 3}
 

@@ -15,7 +15,7 @@ class ViewConfig(TracedConfig):
     """What is traced, and what is shown of it."""
 
     live: bool = False  # open the viewer and show frames as they are traced, in place of a file
-    depth: bool = False  # points in space; a file is then some ten times as large
+    depth: bool = False  # points in space; a file is then several times as large
 
 
 def view_recording(config: ViewConfig, folder: Path, *, on_progress: OnProgress = unobserved) -> Path | None:

@@ -65,6 +65,7 @@ class Picture:
     confidence: Float[np.ndarray, " tag"]
     detected: Bool[np.ndarray, " tag"]
     status: Int8[np.ndarray, " tag"]  # codes of `Status`
+    soft_masks: Float[np.ndarray, "tag rows columns"] | None = None  # the tracer's own, at its resolution
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,7 +213,8 @@ def score_traces(
             ordered = np.stack([masks[tag] for tag in range(len(names))])
             picture = Picture(number, tuple(names), ordered, boxes, confidence, detected[-1], status)
             if number in kept:
-                pictures.append(picture)
+                soft_masks = np.stack([np.asarray(trace.mask[tag], np.float32) for tag in range(len(names))])
+                pictures.append(dataclasses.replace(picture, soft_masks=soft_masks))
             if on_picture is not None:
                 on_picture(picture)
         if on_frame is not None:

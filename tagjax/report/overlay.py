@@ -174,6 +174,6 @@ def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[i
     cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, letters, 1, cv2.LINE_AA)
 
 
-def short_name(epc: str, length: int = 6) -> str:
-    """A shortened EPC: its end, where EPCs of one batch differ."""
-    return epc if len(epc) <= length else f"..{epc[-length:]}"
+def short_name(epc: str) -> str:
+    """The end of an EPC, where those of one batch differ. Names of up to 12 characters, as of virtual tags, stay whole."""
+    return epc if len(epc) <= 12 else f"..{epc[-6:]}"

@@ -1,4 +1,4 @@
-"""One frame of a recording stage by stage, as pictures: colour, depth, flow, change of distance, attention, masks."""
+"""One frame of a recording stage by stage, as pictures: colour, depth, flow, change of distance, log odds or attention, masks."""
 
 from __future__ import annotations
 
@@ -27,6 +27,9 @@ STAGES = "stages.json"
 ALPHA_M2, BETA = 5e-4, 0.8
 """Of the attention as published (Eqs. 4 and 6)."""
 
+MOST_NATS = 8
+"""Log odds at which their colour is full."""
+
 _WIDTH = 320
 _MAX_TAGS = 6
 
@@ -44,7 +47,8 @@ def stage_picture(pictures: Sequence[Picture], from_frame: int) -> Picture | Non
 def write_stages(folder: Path, recording: Recording, picture: Picture, camera: Camera, frames: Frame) -> None:
     """Write a small JPEG of each stage at the frame of `picture`, and `stages.json` with their titles.
 
-    `frames` are the tracer's inputs with the tags of the picture (leading time axis), up to that frame.
+    `frames` are the tracer's inputs with the tags of the picture (leading time axis), up to that frame. A tracer with soft masks shows
+    their log odds; for one whose masks are 0 or 1 the paper's attention is computed from the inputs.
     """
     rays = np.asarray(camera.rays)
     depth_m = np.asarray(frames.depth_m)
@@ -77,7 +81,14 @@ def write_stages(folder: Path, recording: Recording, picture: Picture, camera: C
             change_colours(change_mm, largest_mm),
         ),
     ]
+    soft = picture.soft_masks
+    is_soft = soft is not None and bool(np.any((soft > 0.0) & (soft < 1.0)))
     for tag, epc in list(enumerate(picture.epcs))[:_MAX_TAGS]:
+        if soft is not None and is_soft:
+            title = f"log odds of {short_name(epc)}"
+            text = f"that a pixel is of the tag's object: orange for it, blue against it, by {MOST_NATS} nats or more; grey: not followed"
+            shown.append((title, text, change_colours(log_odds(soft[tag]), float(MOST_NATS))))
+            continue
         rd_m, std_m = np.asarray(frames.radio.relative_m[-1, tag, 0]), np.asarray(frames.radio.std_m[-1, tag, 0])
         valid = motion.valid & motion.valid[..., :1] & jnp.isfinite(jnp.asarray(std_m))[None, None]
         agreement = np.asarray(_attention(rho_m, jnp.asarray(rd_m), valid))
@@ -121,6 +132,13 @@ def change_colours(change_mm: Float[np.ndarray, "height width"], largest_mm: flo
     away, nearer, white = np.array([200, 90, 0]), np.array([0, 90, 170]), np.array([247, 247, 247])
     coloured = np.where(level > 0, white + level * (away - white), white - level * (nearer - white))
     return np.where(np.isfinite(change_mm)[..., None], coloured, 150).astype(np.uint8)
+
+
+def log_odds(mask: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Those of a soft mask, at most `MOST_NATS` either way; NaN where it is 0, which is where nothing is followed."""
+    inside = np.clip(mask.astype(np.float64), 1e-12, 1.0 - 1e-12)
+    nats = np.clip(np.log(inside) - np.log1p(-inside), -MOST_NATS, MOST_NATS)
+    return np.where(mask > 0, nats, np.nan)
 
 
 def grey(level: Float[np.ndarray, "height width"]) -> Image:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from ..tracing.clips import subsampled_depth
 from ..tracing.status import Status, status_or_detected
 from ..tracing.tracer import Trace
 from .overlay import PALETTE_RGB, short_name
-from .stages import change_colours
+from .stages import MOST_NATS, change_colours, log_odds
 
 _JPEG_QUALITY = 70
 _TIME = "time"
@@ -29,9 +30,6 @@ _EXPLANATIONS = {
     "best_segment": ("best segment", (230, 159, 0)),
 }
 """The lines of a tag's evidence: fields of `Evidence` with their names and colours."""
-
-_MOST_NATS = 8
-"""Log odds of pixels are shown up to these, in whole nats."""
 
 
 def rerun() -> Any:
@@ -58,10 +56,15 @@ def log_recording(
     """Log every frame with its trace, frame by frame, to the file `out`, or to a viewer that is opened.
 
     `epcs` and `antennas` (counted from 1) are those of the traces. Times are seconds since the first frame. With `depth`
-    each frame has its depth as well, which viewers show as points in space; without it a file is a tenth of the size.
+    each frame has its depth as well, which viewers show as points in space; without it a file is much smaller.
     """
     rr = rerun()
-    stream = rr.RecordingStream("tagjax")
+    batches = None
+    if out is not None:
+        # By size alone: batched by time as well, a slow tracer leaves a chunk for each value, and the file is nearly twice as large.
+        batches = rr.ChunkBatcherConfig()
+        batches.flush_tick = datetime.timedelta(days=1)
+    stream = rr.RecordingStream("tagjax", batcher_config=batches)
     stream.send_blueprint(_blueprint(epcs, depth=depth))
     if out is None:
         stream.spawn()
@@ -214,16 +217,14 @@ def _log_evidence(rr: Any, stream: Any, trace: Trace, epcs: Sequence[str]) -> No
 
 def log_odds_classes(mask: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
     """The class of each pixel: 0 where the soft mask is 0, else its log odds in whole nats, 1 for -8 and less to 17 for 8 and more."""
-    inside = np.clip(mask.astype(np.float64), 1e-12, 1.0 - 1e-12)
-    nats = np.clip(np.rint(np.log(inside) - np.log1p(-inside)), -_MOST_NATS, _MOST_NATS)
-    return np.where(mask > 0, nats + _MOST_NATS + 1, 0).astype(np.uint8)
+    return np.nan_to_num(np.rint(log_odds(mask)) + MOST_NATS + 1).astype(np.uint8)
 
 
 def _log_odds_classes() -> list[tuple[int, str, tuple[int, int, int]]]:
     """Number, name and colour of each class: blue against the object, white for even odds, orange for it."""
-    nats = np.arange(-_MOST_NATS, _MOST_NATS + 1)
-    colours = change_colours(nats[None].astype(float), float(_MOST_NATS))[0].tolist()
-    named = {-_MOST_NATS: f"-{_MOST_NATS} nats or less", _MOST_NATS: f"+{_MOST_NATS} nats or more"}
+    nats = np.arange(-MOST_NATS, MOST_NATS + 1)
+    colours = change_colours(nats[None].astype(float), float(MOST_NATS))[0].tolist()
+    named = {-MOST_NATS: f"-{MOST_NATS} nats or less", MOST_NATS: f"+{MOST_NATS} nats or more"}
     rows = [
         (number + 1, named.get(one, f"{one:+d} nats"), tuple(colours[number]))
         for number, one in enumerate(nats.tolist())

@@ -18,7 +18,7 @@ PAPER_ACCURACY = {2: 0.99, 6: 0.96}
 
 
 def pair_plot(path: Path, scores: Sequence[RecordingScore]) -> None:
-    """Box plots of R^2 and slope of correct and incorrect pairs."""
+    """Box plots of R^2 and slope of correct and incorrect pairs; the slopes that do not fit into the panel are counted there."""
     figure = blank(7.0, 3.6)
     both = figure.subplots(1, 2)
     for axes, kind, label in zip(both, ("r_squared", "slope"), ("R$^2$", "slope / (4$\\pi$h/$\\lambda$)"), strict=True):
@@ -28,7 +28,12 @@ def pair_plot(path: Path, scores: Sequence[RecordingScore]) -> None:
         axes.set_xticks([1, 2], [f"correct ({len(parts[0])})", f"incorrect ({len(parts[1])})"])
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
-    both[1].set_ylim(-3, 4)
+    bottom, top = -3.0, 4.0
+    both[1].set_ylim(bottom, top)
+    slopes = np.concatenate([one.slope[0] for one in scores] or [np.zeros(0)])
+    if outside := int(np.sum((slopes < bottom) | (slopes > top))):
+        text = f"{outside} of {len(slopes)} slopes lie outside"
+        both[1].annotate(text, (0.02, 0.02), xycoords="axes fraction", fontsize=8)
     save_figure(figure, path, dpi=110)
 
 
@@ -45,7 +50,7 @@ def accuracy_plot(path: Path, accuracy: Mapping[str, Mapping[int, float]]) -> No
             counts + shift, [values[count] for count in counts.tolist()], "o-", label=name, alpha=0.8, markersize=4
         )
     axes.set_xticks(sorted({count for values in accuracy.values() for count in values} | set(PAPER_ACCURACY)))
-    axes.plot(list(PAPER_ACCURACY), list(PAPER_ACCURACY.values()), "k+--", markersize=10, label="paper")
+    axes.plot(list(PAPER_ACCURACY), list(PAPER_ACCURACY.values()), "k+--", markersize=10, label="the paper's Tagview")
     axes.set(xlabel="tags", ylabel="identification accuracy", ylim=(-0.02, 1.05))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)

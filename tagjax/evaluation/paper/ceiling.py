@@ -77,7 +77,7 @@ def pairs(sources: Sources, items: list[Item], path: Path) -> str:
     ]
     write_csv(path.with_suffix(".csv"), ("recording", "of", "correct", "value"), rows)
     parts = []
-    for kind, name in (("r_squared", "R²"), ("slope", "linear coefficient over 4πh/λ")):
+    for kind, name in (("r_squared", "R²"), ("slope", "slope over 4πh/λ")):
         found = quartiles(scores, kind)
         texts = [
             f"{which} {value[1]:.2f} ({value[0]:.2f} to {value[2]:.2f})" for which, value in found.items() if value
@@ -99,6 +99,9 @@ def systems(sources: Sources, items: list[Item], path: Path) -> str:
     return _bars(path, counts, reported)
 
 
+_SETTINGS = {"tagview": "Tagview", "hungarian": "Hungarian algorithm alone"}
+
+
 def by_number(sources: Sources, items: list[Item], path: Path) -> str:
     """Fig. 10: accuracy by the number of tags, of Tagview and of the Hungarian algorithm alone."""
     by_count: dict[str, dict[int, list[RecordingScore]]] = {}
@@ -113,7 +116,7 @@ def by_number(sources: Sources, items: list[Item], path: Path) -> str:
         }
         for name, counts in by_count.items()
     }
-    accuracy_plot(path, accuracy)
+    accuracy_plot(path, {_SETTINGS.get(name, name): values for name, values in accuracy.items()})
     rows = [
         (name, count, sum(one.num_correct for one in ones), sum(one.num_traces for one in ones), len(ones))
         for name, counts in by_count.items()
@@ -210,8 +213,8 @@ def _bars(path: Path, counts: Mapping[str, list[tuple[int, int]]], reported: Map
     ]
     headings = ("of", "correct", "all", "accuracy", "low", "high", "recordings")
     write_csv(path.with_suffix(".csv"), headings, rows)
-    texts = [f"{name.replace(chr(10), ' ')} {_number(one.value)} of {one.count}" for name, one in bars.items()]
-    return f"Identified: {', '.join(texts)}."
+    texts = [f"{name.replace(chr(10), ' ')} {one.total:.0f} of {one.count}" for name, one in bars.items()]
+    return f"Identified: {'; '.join(texts)}."
 
 
 def _number(value: float | None) -> str:

@@ -61,11 +61,10 @@ def by_threshold(sources: Sources, items: list[Item], path: Path) -> str:
     settings = sources.config.tracers[PUBLISHED]
     panels = []
     for name, own in _by_variant(items).items():
-        lines: Lines = {}
+        lines: Lines = {"learnable (no threshold)": _curves(sources, sources.system(LEARNABLE), own)}
         for v0 in V0_M_S:
             system = System(f"published, v0 {v0:g} m/s", with_values(settings, {"v0_m_s": v0}))
-            lines[f"as published, $v_0$ = {v0:g} m/s"] = _curves(sources, system, own)
-        lines["learnable, no threshold"] = _curves(sources, sources.system(LEARNABLE), own)
+            lines[f"as published with $v_0$ = {v0:g} m/s"] = _curves(sources, system, own)
         panels.append(Panel(f"{name} target", lines))
     return _draw(path, panels, scores=("iou",))
 

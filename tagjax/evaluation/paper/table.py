@@ -162,7 +162,7 @@ FIGURES: dict[str, PaperFigure] = {
     ),
     "tagview_8": PaperFigure(
         TAGVIEW, 8, _CEILING, ceiling.pairs,
-        "R² and linear coefficient (over its true value) of the fit of each trace to each tag, for correct and for incorrect pairs.",
+        "R² and slope (the linear coefficient, over its true value 4πh/λ) of the fit of each trace to each tag, for correct and for incorrect pairs.",
         "Correct pairs have larger R² and denser coefficients; the Hungarian algorithm alone identifies 0.91 on average.",
     ),
     "tagview_9": PaperFigure(

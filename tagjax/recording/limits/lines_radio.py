@@ -26,8 +26,8 @@ def radio_lines(recording: Recording, tags: list[TagLimits], thresholds: Thresho
 
 
 def short(epc: str) -> str:
-    """The end of an EPC, by which people tell tags apart."""
-    return epc if len(epc) <= 8 else f"…{epc[-6:]}"
+    """The end of an EPC, where those of one batch differ; short names stay whole."""
+    return epc if len(epc) <= 12 else f"…{epc[-6:]}"
 
 
 def _of_tags(

@@ -12,7 +12,7 @@ from .style import FONT, LINES, OTHER, TRUTH, save_small, sheet, tidy
 
 
 def bar_figure(path: Path, bars: Mapping[str, Estimate], *, ylabel: str, reported: Mapping[str, float]) -> None:
-    """A bar for each name from 0 to 1 with its interval by recording, its value and count; the paper's values are lines."""
+    """A bar for each name from 0 to 1 with its interval by recording, how many of how many; the paper's values are lines."""
     figure = sheet(3.2)
     axes = figure.subplots()
     for number, (name, one) in enumerate(bars.items()):
@@ -22,7 +22,7 @@ def bar_figure(path: Path, bars: Mapping[str, Estimate], *, ylabel: str, reporte
         if one.low is not None and one.high is not None:
             ends = [[one.value - one.low], [one.high - one.value]]
             axes.errorbar(number, one.value, yerr=np.maximum(ends, 0.0), color=TRUTH, capsize=4, linewidth=1.2)
-        text = f"{one.value:.2f} of {one.count}"
+        text = f"{one.total:.0f} of {one.count}"
         axes.annotate(text, (number, 0.03), ha="center", fontsize=FONT, color="white", fontweight="bold")
         if name in reported:
             axes.plot([number - 0.4, number + 0.4], [reported[name]] * 2, "--", color=OTHER, linewidth=1.8)

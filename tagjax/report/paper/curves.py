@@ -59,7 +59,8 @@ def score_figure(path: Path, panels: Sequence[Panel], *, scores: Sequence[str] =
     figure.supxlabel("frames since the first motion", fontsize=FONT)
     if all(list(panel.lines) == list(panels[0].lines) for panel in panels):
         handles = grid[0][0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper center", ncols=3, fontsize=FONT, frameon=False)
+        ncols = 2 if len(handles[0]) == 4 else 3
+        figure.legend(*handles, loc="outside upper center", ncols=ncols, fontsize=FONT, frameon=False)
     else:
         for axes in grid[-1]:
             axes.legend(fontsize=FONT - 0.5, loc="upper right")
