@@ -3,6 +3,7 @@
 python -m experiments.reads_ceiling 'suites=[multi_4]'
 python -m experiments.reads_ceiling 'suites=[multi_2,multi_4]' split=train max_recordings=2 'memories_s=[null,2.5,1]'
 python -m experiments.reads_ceiling 'suites=[multi_4]' evidence.hop_spread_rad=0.3
+python -m experiments.reads_ceiling 'suites=[walkers]' num_antennas=4 'antennas=[1,3]' recordings_dir=recordings/antennas_4
 
 The candidates of a tag are the true distances of all tags of its recording; the one with the highest likelihood of the
 tag's reads wins (docs/ceilings.md). Recordings of one tag are refused: nothing competes there.

@@ -107,6 +107,16 @@ def test_a_start_puts_frames_and_depth_on_one_clock(video, tmp_path):
         imported(video, tmp_path / "b.zarr", start="yesterday")
 
 
+def test_depth_may_count_from_the_first_frame_whatever_the_start(video, tmp_path):
+    start_ns = 1_700_000_000_500_000_000
+    by_name = imported(video, tmp_path / "names.zarr", start="2023-11-14T22:13:20.5Z")
+    write_camera(video.parent / "camera.json", times="frames", fps=FPS)
+    by_number = imported(video, tmp_path / "numbers.zarr", start="2023-11-14T22:13:20.5Z")
+    for recording in (by_name, by_number):
+        np.testing.assert_array_equal(recording.time_ns, start_ns + np.arange(NUM_FRAMES) * 40_000_000)
+        np.testing.assert_array_equal(recording.depth[3], depth_mm(3))
+
+
 def test_depth_by_number_needs_one_picture_a_frame(video, tmp_path):
     write_camera(video.parent / "camera.json", times="frames")
     (video.parent / "depth" / "0.045.png").unlink()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from jax import numpy as jnp
 from experiments.suites import suites_named
 from tagjax.core.numerics import SPEED_OF_LIGHT_M_S
 from tagjax.core.settings import ConfigError, from_mapping
+from tagjax.evaluation import suite_items
 from tagjax.evaluation.reads_ceiling import CeilingConfig, run_ceiling
 from tagjax.evaluation.reads_ceiling.candidates import Memory, candidates_of, winners
 from tagjax.evaluation.reads_ceiling.likelihood import (
@@ -24,12 +26,13 @@ from tagjax.evaluation.reads_ceiling.likelihood import (
     log_i0,
     read_phasors,
 )
-from tagjax.evaluation.reads_ceiling.run import ceilings
+from tagjax.evaluation.reads_ceiling.run import _with_antennas, ceilings
 from tagjax.evaluation.true_distance import at_times, true_distance_m
 from tagjax.metrics.recordings import ScoreSettings
 from tagjax.radio.noise import thermal_sigma_rad
 from tagjax.radio.reader_model import ReaderModel
 from tagjax.recording import RecordingError, TagReads
+from tagjax.recording.reads import concatenate_reads
 
 RSSI_DBM = -55.0
 PLAIN = EvidenceSettings(spread_rad=0.1, slack=0.0, doubled_angle=False)
@@ -217,6 +220,23 @@ def test_scores_are_those_of_the_winners_true_mask() -> None:
     assert wrong.scores().result()["iou"] < 0.1
 
 
+def test_the_reads_of_chosen_antennas_of_a_suite_with_several(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = synthetic.recording(10)
+    second = dataclasses.replace(recording.reads, antenna=np.full(recording.reads.num_reads, 2, np.int16))
+    several = dataclasses.replace(
+        recording, reads=concatenate_reads([recording.reads, second]), antennas_m=np.zeros((2, 3))
+    )
+    assert set(_with_antennas(several, (2,)).reads.antenna) == {2}
+    assert _with_antennas(several, None) is several
+    with pytest.raises(RecordingError, match="no read of antenna 3; expected antennas among 1, 2"):
+        _with_antennas(several, (1, 3))
+    asked: list[Any] = []
+    monkeypatch.setattr(suite_items, "make_items", lambda suite, *_, **__: asked.append(suite) or suite.items())
+    config = CeilingConfig(suites=suites_named(["walkers"]), num_antennas=4, recordings_dir=str(tmp_path))
+    config.all_items()
+    assert asked[0].settings == {**asked[0].settings, "num_antennas": 4, "room": "hall", "num_people": 3}
+
+
 def test_a_recording_of_one_tag_is_refused() -> None:
     recording = synthetic.recording(10)
     alone = recording.with_reads(recording.reads.select("tag-a"))
@@ -230,6 +250,8 @@ def test_settings_that_mean_nothing_are_refused() -> None:
     suites = suites_named(["multi_2"])
     with pytest.raises(ConfigError, match=r"memories_s is \[0\.0\]"):
         CeilingConfig(suites=suites, memories_s=(0.0,))
+    with pytest.raises(ConfigError, match=r"antennas is \[0\]"):
+        CeilingConfig(suites=suites, antennas=(0,))
     with pytest.raises(ConfigError, match="split is 'exam'"):
         CeilingConfig(suites=suites, split="exam")
     with pytest.raises(ConfigError, match="suites is empty"):

@@ -21,6 +21,7 @@ from ...metrics.recordings import RecordingResult, ScoreSettings, score_traces
 from ...metrics.tags import CLEAR, Scores
 from ...recording import Recording, RecordingError
 from ...report.intervals import MarkedRow, marker_plot
+from ...sim.suites import Item
 from ...tracing.tracer import Trace
 from ..suite_items import SuiteSelection
 from .candidates import Memory, candidates_of, evidence_of_candidates, winners
@@ -37,6 +38,8 @@ class CeilingConfig(SuiteSelection):
     """The suites, the memories whose ceilings are compared, and the noise of the reads."""
 
     memories_s: tuple[float | None, ...] = (None, 2.5)  # evidence of the last so many seconds; of all so far if None
+    num_antennas: int | None = None  # of the simulated recordings; those of the suite if None
+    antennas: tuple[int, ...] | None = None  # whose reads count, from 1; all if None
     evidence: EvidenceSettings = dataclasses.field(default_factory=EvidenceSettings)
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 
@@ -46,6 +49,17 @@ class CeilingConfig(SuiteSelection):
             raise ConfigError(
                 f"memories_s is {list(self.memories_s)}; expected positive times in seconds, or null for all reads so far."
             )
+        if self.antennas is not None and (not self.antennas or min(self.antennas) < 1):
+            raise ConfigError(f"antennas is {list(self.antennas)}; expected numbers from 1, or null for all antennas.")
+
+    def items(self, name: str, report: OnProgress = unobserved) -> list[Item]:
+        """As of every selection, with `num_antennas` in the suite's settings."""
+        if self.num_antennas is None:
+            return super().items(name, report)
+        suite = dict(self.suites[name])
+        suite["settings"] = {**suite.get("settings", {}), "num_antennas": self.num_antennas}
+        with_them = {**self.suites, name: suite}
+        return dataclasses.replace(self, suites=with_them, num_antennas=None).items(name, report)
 
     @property
     def memories(self) -> tuple[Memory, ...]:
@@ -68,7 +82,7 @@ def run_ceiling(
         scores: list[list[Scores]] = [[] for _ in config.memories]
         for item in items[suite]:
             on_progress("measure", done, total, item.name)
-            recording = config.open(item)
+            recording = _with_antennas(config.open(item), config.antennas)
             results = ceilings(recording, config.evidence, config.memories, config.scores)
             for kept, result in zip(scores, results, strict=True):
                 kept.append(result.scores())
@@ -81,6 +95,19 @@ def run_ceiling(
         _write(folder, rows, tags)
     on_progress("measure", done, total)
     return rows, tags
+
+
+def _with_antennas(recording: Recording, antennas: Sequence[int] | None) -> Recording:
+    """The recording with the reads of these antennas. Raises `RecordingError` for one that read no tag."""
+    if antennas is None:
+        return recording
+    reads = recording.reads
+    if unread := sorted(set(antennas) - set(reads.antenna.tolist())):
+        raise RecordingError(
+            f"{recording.name}: found no read of antenna {', '.join(map(str, unread))}; expected antennas among "
+            f"{', '.join(map(str, np.unique(reads.antenna).tolist()))}."
+        )
+    return recording.with_reads(reads[np.isin(reads.antenna, antennas)])
 
 
 def ceilings(

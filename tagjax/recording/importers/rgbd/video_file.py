@@ -18,13 +18,15 @@ from .times import check_counts, picture_files, start_time_ns, timed_files
 
 ENDINGS = (".mp4", ".mov", ".avi", ".m4v")
 
+_DAY_NS = 86_400 * 10**9  # since 1970: earlier times are no dates
+
 
 def open_video(path: Path, camera_file: Path | None = None, start: str | float | None = None) -> RgbdSource:
     """A video with depth pictures in the folder depth/, <video>_depth/ or `depth_folder` beside it.
 
     The camera file is <video>.json, <video>.yaml or camera.json beside the video. Frame times are the container's. `start`
-    (ISO, or seconds since 1970; else the camera file's) is the time of the first frame: depth names are then times of the
-    same clock, and without it seconds since the first frame. Raises `RecordingError` for files that are missing or cannot be
+    (ISO, or seconds since 1970; else the camera file's) is the time of the first frame. Times of depth are of the same clock,
+    or, where they begin within a day of 0, since the first frame. Raises `RecordingError` for files that are missing or cannot be
     used, and, while it is read, for a video that is cut short.
     """
     found = camera_file or find_camera_file(path.parent, *(f"{path.stem}{end}" for end in (".json", ".yaml", ".yml")))
@@ -41,7 +43,7 @@ def open_video(path: Path, camera_file: Path | None = None, start: str | float |
         check_counts(str(folder), files, num_frames, "depth pictures")
     else:
         files = None
-    timed = None if files is not None else timed_files(folder, path.parent, camera)
+    timed = None if files is not None else _on_clock(timed_files(folder, path.parent, camera), start_ns)
 
     def pictures() -> Iterator[Picture]:
         frames = _frames(path, num_frames, start_ns)
@@ -56,6 +58,13 @@ def open_video(path: Path, camera_file: Path | None = None, start: str | float |
         pictures=pictures,
         max_gap_s=camera.max_gap_s,
     )
+
+
+def _on_clock(timed: list[tuple[int, Path]], start_ns: int | None) -> list[tuple[int, Path]]:
+    """Times since the first frame, on the clock of `start_ns`; times of day as they are."""
+    if start_ns is None or start_ns < _DAY_NS or timed[0][0] >= _DAY_NS:
+        return timed
+    return [(start_ns + time_ns, path) for time_ns, path in timed]
 
 
 def _count(path: Path) -> int:
