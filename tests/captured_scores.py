@@ -75,20 +75,26 @@ def clock_error_s(played: Recording, captured: Recording) -> float:
 
 
 def compare(played: Recording, captured: Recording, settings: Mapping[str, Any]) -> dict[str, float]:
-    """Scores of both recordings with one tracer, of settings as under conf/tracer, and how well its boxes overlap."""
+    """Scores of both recordings with one tracer, of settings as under conf/tracer, and how well its boxes overlap.
+
+    The overlap is over the tag-frames at which the tracer gives a box in both; `boxes_in_one_only` counts the others.
+    """
     tracer, clips = make_tracer(settings), tracer_clips(settings)
     traces, scores = [], []
     for one in (played, with_truth_of(captured, played)):
         found = list(trace_recording(tracer, one, clip_loader(clips), epcs=played.reads.epcs))
         traces.append([np.asarray(trace.box_px) for _, trace in found])
         scores.append(score_traces(found, one, played.reads.epcs, stride=clips.stride).scores().means)
-    overlap = box_iou(*(np.concatenate(boxes) for boxes in traces))
+    first, second = (np.concatenate(boxes) for boxes in traces)
+    found_in = [np.isfinite(boxes).all(axis=1) for boxes in (first, second)]
     return {
         "iou": scores[0]["iou"].result(),
         "iou_captured": scores[1]["iou"].result(),
         "identification": scores[0]["identification"].result(),
         "identification_captured": scores[1]["identification"].result(),
-        "box_overlap": float(np.nanmean(overlap)),
+        "box_overlap": float(np.nanmean(box_iou(first, second))),
+        "boxes_in_one_only": int(np.sum(found_in[0] != found_in[1])),
+        "tag_frames": len(first),
     }
 
 
