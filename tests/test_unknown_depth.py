@@ -115,6 +115,14 @@ def test_rays_of_nominal_and_of_true_depth_are_the_same() -> None:
     assert np.isinf(motion.rate_variance).all()
 
 
+@pytest.mark.parametrize("nearer_m", [0.0, 1e-20, -0.3])
+def test_a_segment_out_of_view_has_a_finite_ray(nearer_m: float) -> None:
+    """Its place is 0, its remembered displacement is not: a ray of 1e19 became the NaN of every segment's scale."""
+    motion = RayMotion.of(jnp.zeros((1, 3)), jnp.array([[0.02, -0.01, -nearer_m]]))
+    assert np.all(np.abs(motion.ray) < 1.0)
+    assert np.all(np.abs(motion.turn) < 1.0)
+
+
 def test_new_segments_of_the_background_may_have_any_depth() -> None:
     stage = UnknownDepth()
     state = stage.init(1, 4, 4)

@@ -38,6 +38,7 @@ from .step import SegmentFrame
 from .travel import Pooling
 
 _SHORTEST_FRAME_S = 1e-6
+_NEAREST_M = 0.05
 _CARRIER_HZ = 915e6  # before the first read; no phase has been measured then
 
 
@@ -75,9 +76,12 @@ class RayMotion(eqx.Module):
 
     @staticmethod
     def of(centre_m: Float[Array, "segment 3"], motion_m: Float[Array, "segment 3"]) -> RayMotion:
-        """Of segments whose places and motions have any depth above 0, such as a nominal one; nothing of the rate."""
+        """Of segments whose places and motions have a depth, such as a nominal one; nothing of the rate.
+
+        A segment out of view has depth 0, and its ray says nothing. Nearer than `_NEAREST_M` nothing is seen: the rays stay finite.
+        """
         before = centre_m - motion_m
-        ray, last = (one[:, :2] / jnp.where(one[:, 2:] > 0, one[:, 2:], 1.0) for one in (centre_m, before))
+        ray, last = (one[:, :2] / jnp.where(one[:, 2:] > _NEAREST_M, one[:, 2:], 1.0) for one in (centre_m, before))
         return RayMotion(ray, ray - last, jnp.zeros(len(ray)), jnp.full(len(ray), jnp.inf))
 
 
