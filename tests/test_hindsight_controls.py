@@ -136,15 +136,16 @@ def test_a_control_teaches_detection_its_true_slope_and_nothing_else(piece: Piec
 def test_detection_has_the_slope_that_the_whole_tracer_gives_it(piece: Piece) -> None:
     learnable, static = eqx.partition(TRACER, eqx.is_inexact_array)
 
-    def slopes(settings: HindsightSettings) -> Any:
+    settings = dataclasses.replace(SETTINGS, memory=0.9)
+
+    def slopes(alone: bool) -> Any:
         def wrong(values: Any) -> Any:
-            return hindsight_sums(eqx.combine(values, static), piece.camera, piece.frames, settings).wrong
+            tracer = eqx.combine(values, static)
+            return hindsight_sums(tracer, piece.camera, piece.frames, settings, detection_alone=alone).wrong
 
         return jax.jit(jax.grad(wrong))(learnable)
 
-    alone = dataclasses.replace(SETTINGS, memory=0.9)
-    through_all = slopes(dataclasses.replace(alone, learn="masks"))  # also differentiates what detection is given
-    for one, other in zip(*(jax.tree.leaves(each.detection) for each in (through_all, slopes(alone))), strict=True):
+    for one, other in zip(*(jax.tree.leaves(slopes(alone).detection) for alone in (False, True)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
 
 
@@ -171,10 +172,13 @@ def test_files_hold_the_controls_and_are_the_same_each_time(piece: Piece, tmp_pa
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"hindsight": {"learn": "body"}}, r"hindsight\.learn: found 'body'; expected one of 'masks', 'confidence'"),
+        (
+            {"hindsight": {"learn": "body"}},
+            r"hindsight\.learn: found 'body'; expected one of 'all', 'masks', 'confidence'",
+        ),
         ({"hindsight": {"controls": 1.0}}, r"hindsight: controls is 1\.0; expected a fraction from 0 to 1, 1 excluded"),
         (
-            {"data": {"control": "shifted"}, "hindsight": {"learn": "confidence"}},
+            {"data": {"control": "shifted"}, "hindsight": {"controls": 0.1}},
             r"data\.control is shifted and hindsight\.controls is 0\.1; expected one of them",
         ),
     ],
@@ -184,13 +188,8 @@ def test_settings_that_cannot_be_used_are_refused(given: dict[str, Any], message
         from_mapping(TrainConfig, {**LEAST, **given})
 
 
-def test_only_the_confidence_has_controls_and_a_run_on_controls_may_have_none() -> None:
-    foreign = {"data": {"control": "foreign"}}
-    masks = from_mapping(TrainConfig, {**LEAST, **foreign}).learned
-    assert isinstance(masks, HindsightSettings)
-    assert not masks.needs_controls
-    without = {"hindsight": {"learn": "confidence", "controls": 0.0}}
-    assert from_mapping(TrainConfig, {**LEAST, **foreign, **without}).hindsight == HindsightSettings(
-        learn="confidence", controls=0.0
-    )
-    assert HindsightSettings(learn="confidence").needs_controls
+def test_only_the_confidence_has_controls_and_a_run_on_controls_has_none_of_its_own() -> None:
+    assert HindsightSettings(controls=0.1).needs_controls
+    assert not HindsightSettings(controls=0.1, learn="masks").needs_controls
+    given = {"data": {"control": "foreign"}, "hindsight": {"learn": "masks", "controls": 0.1}}
+    assert from_mapping(TrainConfig, {**LEAST, **given}).hindsight == HindsightSettings(learn="masks", controls=0.1)

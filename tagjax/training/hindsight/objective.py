@@ -34,8 +34,8 @@ class HindsightSettings:
     clip_norm: float = 0.3  # of a piece's gradient, at most: some have 50 times the median
     piece_frames: int = 256  # a recording is cut into pieces of at most so many frames
     teacher: Teacher = "smoother"  # or labels: the true masks of simulated recordings, to compare with
-    learn: Literal["masks", "confidence"] = "masks"  # masks: all stages but detection; confidence: detection alone
-    controls: float = 0.1  # of the confidence: fraction of reads taken to belong to nothing in view; 0: none
+    learn: Literal["all", "masks", "confidence"] = "all"  # masks: all stages but detection; confidence: detection
+    controls: float = 0.0  # of the confidence: fraction of reads taken to belong to nothing in view; 0: none
     term_norms: ClassVar[bool] = False  # there is one term
 
     def __post_init__(self) -> None:
@@ -53,7 +53,7 @@ class HindsightSettings:
     @property
     def needs_controls(self) -> bool:
         """Whether control reads take part."""
-        return self.learn == "confidence" and self.controls > 0
+        return self.learn != "masks" and self.controls > 0
 
     def weights(self) -> dict[str, float]:
         """The weight of each term."""
@@ -69,16 +69,18 @@ class HindsightSettings:
     ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
         """The loss of a piece, and what it consists of."""
         assert isinstance(tracer, TagAttention)
-        sums = hindsight_sums(tracer, camera, frames, self)
-        if self.learn == "masks":
+        loss = jnp.zeros(())
+        if self.learn != "confidence":
+            sums = hindsight_sums(tracer, camera, frames, self)
             loss = safe_divide(sums.missed, sums.num_there)
-        else:
-            loss = safe_divide(sums.wrong, sums.num_there + sums.num_away)
+        if self.learn != "masks":
+            sums = hindsight_sums(tracer, camera, frames, self, detection_alone=True)
+            loss = loss + safe_divide(sums.wrong, sums.num_there + sums.num_away)
         logged = {
             "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
             "false_confidence": safe_divide(sums.claimed, sums.num_away),
         }
-        if frames.control is not None:
+        if frames.control is not None and self.needs_controls:
             strange = control_sums(tracer, camera, frames, self)
             loss = loss + self.controls / (1.0 - self.controls) * safe_divide(strange.wrong, strange.num)
             logged["false_confidence/control"] = safe_divide(strange.claimed, strange.num)
@@ -104,16 +106,21 @@ class ControlSums(NamedTuple):
 
 
 def hindsight_sums(
-    tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings
+    tracer: TagAttention,
+    camera: Camera,
+    frames: PieceFrames,
+    settings: HindsightSettings,
+    *,
+    detection_alone: bool = False,
 ) -> HindsightSums:
     """The two questions of each tag-frame: where the object is, and how sure one may be of it.
 
     IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should be
     the probability that the mask is right, that is, of an IoU above 0.3: its squared error is least where it is (a
-    proper score; Brier, 1950). The mask does not depend on detection, so it teaches every other stage; the confidence teaches
-    detection alone.
+    proper score; Brier, 1950). The mask does not depend on detection, so it teaches every other stage. With `detection_alone`
+    the others get no gradient: the confidence must not teach them.
     """
-    if settings.learn == "confidence":
+    if detection_alone:
         overlap, confidence, size = _of_detection(tracer, camera, frames, settings.memory)
     else:
         before = lambda state: faded(state, settings.memory)  # noqa: E731
