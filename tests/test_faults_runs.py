@@ -111,6 +111,7 @@ def test_a_command_that_is_interrupted_before_hydra_is_there_ends_in_one_line(
 
 
 @both_signals
+@pytest.mark.ci
 @pytest.mark.parametrize("more", [[], ["-m", "seed=0,1"]], ids=["run", "sweep"])
 def test_a_command_that_is_interrupted_during_its_imports_ends_in_one_line(
     more: list[str], number: signal.Signals, tmp_path: Path
@@ -401,6 +402,7 @@ def test_a_run_on_a_full_disk_ends_in_one_line_and_resumes(scene: str, tmp_path:
     _same(straight, broken)
 
 
+@pytest.mark.ci
 def test_a_full_disk_leaves_the_checkpoints_before_it(tmp_path: Path) -> None:
     script = """
         import equinox as eqx, jax, jax.numpy as jnp
@@ -460,6 +462,7 @@ def test_a_suite_whose_description_could_not_be_written_is_simulated_later(
     assert (tmp_path / "tiny" / "suite.json").is_file()
 
 
+@pytest.mark.ci
 def test_a_full_disk_is_reported_in_one_line_and_the_folder_is_usable_afterwards(tmp_path: Path) -> None:
     """On a file system that is really full; only root can make one."""
     disk, video = tmp_path / "disk", _tum_folder(tmp_path / "freiburg3_test")
@@ -580,6 +583,7 @@ def test_a_folder_in_use_is_refused_with_the_process_until_that_is_killed(
         pass
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("command", ["train", "train_flow", "evaluate", "sweep_paper", "simulate"])
 def test_a_second_run_in_a_folder_ends_in_one_line_and_changes_nothing(
     command: str, holder: subprocess.Popen[str], scene: str, tmp_path: Path
@@ -725,6 +729,7 @@ def test_flow_is_stored_in_a_recording_that_a_link_leads_to(scene: str, tmp_path
     assert list((tmp_path / "scene.zarr" / "cache" / "flow").iterdir())
 
 
+@pytest.mark.ci
 def test_an_error_of_a_sweep_s_job_that_the_user_can_correct_is_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "experiments.evaluate", "-m", f"run={tmp_path / 'none'}"]
     process = _start([*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"])

@@ -122,6 +122,7 @@ def test_the_loss_is_that_of_the_masks(piece: Piece) -> None:
     np.testing.assert_allclose(logged["overlap"], 1 - np.mean(missed), rtol=1e-4)
 
 
+@pytest.mark.ci
 def test_masks_teach_all_but_detection_and_the_confidence_detection_alone(piece: Piece) -> None:
     learnable, static = eqx.partition(TRACER, eqx.is_inexact_array)
 

@@ -69,13 +69,12 @@ class HindsightSettings:
     ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
         """The loss of a piece, and what it consists of."""
         assert isinstance(tracer, TagAttention)
-        loss = jnp.zeros(())
-        if self.learn != "confidence":
-            sums = hindsight_sums(tracer, camera, frames, self)
-            loss = safe_divide(sums.missed, sums.num_there)
+        teaches_masks = self.learn != "confidence"
+        sums = hindsight_sums(tracer, camera, frames, self, detection_alone=not teaches_masks)
+        loss = safe_divide(sums.missed, sums.num_there) if teaches_masks else jnp.zeros(())
         if self.learn != "masks":
-            sums = hindsight_sums(tracer, camera, frames, self, detection_alone=True)
-            loss = loss + safe_divide(sums.wrong, sums.num_there + sums.num_away)
+            judged = hindsight_sums(tracer, camera, frames, self, detection_alone=True) if teaches_masks else sums
+            loss = loss + safe_divide(judged.wrong, judged.num_there + judged.num_away)
         logged = {
             "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
             "false_confidence": safe_divide(sums.claimed, sums.num_away),
