@@ -2,8 +2,8 @@
 
 python tests/captured_scores.py recordings/single_static/train/single_static-bottle-train-0.zarr llrp r700
 
-The reader's clock is 200 ppm too fast and the network is held up for up to 20 ms. The captured recording has no truth; it is
-scored with that of the recording that was played, whose frames it has.
+The reader's clock is 200 ppm too fast and the network is held up for up to 20 ms. The captured recording has no
+ground truth. It has the same frames as the recording that was played, so it is scored with that one's truth.
 """
 
 from __future__ import annotations

@@ -171,7 +171,6 @@ def test_a_simulated_recording_is_traced_alike_after_it_went_through_sockets(
     assert clock_error_s(one, other) < 1e-3
     found = compare(one, other, {"_target_": "tagjax.tagattention.TagAttention"})
     assert found["iou"] > 0.1
-    print(found)
     assert found["box_overlap"] > 0.995
     assert found["boxes_in_one_only"] <= 2
     assert found["iou_captured"] == pytest.approx(found["iou"], abs=0.02)

@@ -16,8 +16,8 @@ import pytest
 import synthetic_clips as synthetic
 from report_runs import NUM_FRAMES, report_run
 
+from tagjax.core.names import short_name
 from tagjax.metrics.recordings import ScoreSettings, evaluate_recording
-from tagjax.report.overlay import short_name
 from tagjax.report.page import PAGE, pictures, write_page
 from tagjax.report.page.contents import read_contents
 from tagjax.report.page.html import element

@@ -31,6 +31,11 @@ def name_fault(name: object) -> str | None:
     return None
 
 
+def short_name(epc: str, mark: str = "..") -> str:
+    """The end of an EPC after a mark, where those of one batch differ. Names of up to 12 characters, as of virtual tags, stay whole."""
+    return epc if len(epc) <= 12 else f"{mark}{epc[-6:]}"
+
+
 def safe_file_name(text: str) -> str:
     """A file name of at most 90 bytes that stays in its folder, on every system: `text` itself if it is one already.
 

@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from ..core.camera import working_stride
+from ..core.names import short_name
 from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError
 from ..metrics.recordings import box_to_picture, mask_to_picture
 from ..recording import Recording
-from ..report.overlay import draw_overlay, scaled_boxes, short_name, true_boxes
+from ..report.overlay import draw_overlay, scaled_boxes, true_boxes
 from ..tracing.status import status_or_detected
 from ..tracing.tracer import Trace
 from .traced import Traced, TracedConfig

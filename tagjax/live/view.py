@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from ..core.names import short_name
 from ..core.results import to_json_values
-from ..report.overlay import draw_overlay, scaled_boxes, short_name
+from ..report.overlay import draw_overlay, scaled_boxes
 from ..tracing.status import Status
 from .events import Event, Sighting
 

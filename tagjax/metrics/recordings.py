@@ -213,7 +213,7 @@ def score_traces(
             ordered = np.stack([masks[tag] for tag in range(len(names))])
             picture = Picture(number, tuple(names), ordered, boxes, confidence, detected[-1], status)
             if number in kept:
-                soft_masks = np.stack([np.asarray(trace.mask[tag], np.float32) for tag in range(len(names))])
+                soft_masks = np.asarray(trace.mask[: len(names)], np.float32)
                 pictures.append(dataclasses.replace(picture, soft_masks=soft_masks))
             if on_picture is not None:
                 on_picture(picture)

@@ -20,7 +20,9 @@ MAX_ANTENNA_M = 100.0
 MAX_OUTSIDE = 0.5
 """A recording is refused if a larger fraction of its reads lies outside of the video's time."""
 
-_DAY_NS = 86_400 * 10**9  # since 1970: earlier times are no dates
+FIRST_DATE_NS = 86_400 * 10**9
+"""Times before the second day of 1970 are no dates: they count from the first frame."""
+
 _WARN_OUTSIDE = 0.05
 _MARGIN_NS = 500_000_000  # a reader starts and ends a little before or after the camera
 _MAX_LABEL = 254  # 255 is ignored
@@ -97,7 +99,7 @@ def check_time_of_reads(recording: Recording) -> None:
         f"{last_s:+.1f} s after the first frame, the video lasts {length_s:.1f} s)"
     )
     if outside > MAX_OUTSIDE:
-        if int(time_ns[0]) < _DAY_NS <= reads.time_ns.min():
+        if int(time_ns[0]) < FIRST_DATE_NS <= reads.time_ns.min():
             raise RecordingError(
                 f"{found}. The video's times count from 0, those of the reads do not: import with start=<time of the first frame, "
                 "2025-06-01T12:00:00.250Z or seconds since 1970>."

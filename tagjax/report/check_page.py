@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ..core.files import write_atomic
+from ..core.names import short_name
 from ..recording.limits import Limits, Line
 from ..recording.limits.tags import TagLimits
-from .overlay import short_name
 from .page.charts import Line as Curve
 from .page.charts import line_chart
 from .page.document import document

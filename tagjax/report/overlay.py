@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Shaped, UInt8
 
+from ..core.names import short_name
 from ..metrics.boxes import label_box
 from ..metrics.recordings import Picture
 from ..recording import Recording
@@ -172,8 +173,3 @@ def _text(picture: np.ndarray, text: str, place: tuple[int, int], shade: tuple[i
     cv2.rectangle(picture, (left - 2, top), (right, bottom), shade, cv2.FILLED)
     letters = (0, 0, 0) if float(np.dot(shade, _LUMA)) > _BRIGHT else (255, 255, 255)
     cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, letters, 1, cv2.LINE_AA)
-
-
-def short_name(epc: str) -> str:
-    """The end of an EPC, where those of one batch differ. Names of up to 12 characters, as of virtual tags, stay whole."""
-    return epc if len(epc) <= 12 else f"..{epc[-6:]}"

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
+from ..core.names import short_name
 from ..core.results import write_json
 from ..metrics.recordings import Picture
 from ..recording import Recording
@@ -19,7 +20,7 @@ from ..tagattention.attention import att_corr, att_rbf, attention, centre_first
 from ..tagattention.motion import empty_motion, push_splat
 from ..tracing.tracer import Camera, Frame
 from .flow import flow_colours
-from .overlay import PALETTE_RGB, short_name
+from .overlay import PALETTE_RGB
 
 STAGES = "stages.json"
 """File name of the list of a recording's stage pictures, each with its title and what it shows."""
@@ -47,8 +48,8 @@ def stage_picture(pictures: Sequence[Picture], from_frame: int) -> Picture | Non
 def write_stages(folder: Path, recording: Recording, picture: Picture, camera: Camera, frames: Frame) -> None:
     """Write a small JPEG of each stage at the frame of `picture`, and `stages.json` with their titles.
 
-    `frames` are the tracer's inputs with the tags of the picture (leading time axis), up to that frame. A tracer with soft masks shows
-    their log odds; for one whose masks are 0 or 1 the paper's attention is computed from the inputs.
+    `frames` are the tracer's inputs with the tags of the picture (leading time axis), up to that frame. The log odds of
+    soft masks are shown. Where a tracer's masks are 0 or 1, the paper's attention is computed from the inputs instead.
     """
     rays = np.asarray(camera.rays)
     depth_m = np.asarray(frames.depth_m)

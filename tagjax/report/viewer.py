@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..core.camera import working_stride
+from ..core.names import short_name
 from ..core.settings import ConfigError
 from ..recording import Recording
 from ..tracing.clips import subsampled_depth
 from ..tracing.status import Status, status_or_detected
 from ..tracing.tracer import Trace
-from .overlay import PALETTE_RGB, short_name
+from .overlay import PALETTE_RGB
 from .stages import MOST_NATS, change_colours, log_odds
 
 _JPEG_QUALITY = 70

@@ -39,7 +39,7 @@ class CeilingConfig(SuiteSelection):
 
     memories_s: tuple[float | None, ...] = (None, 2.5)  # evidence of the last so many seconds; of all so far if None
     num_antennas: int | None = None  # of the simulated recordings; those of the suite if None
-    antennas: tuple[int, ...] | None = None  # whose reads count, from 1; all if None
+    antennas: tuple[int, ...] | None = None  # only their reads are used, numbered from 1; all if None
     evidence: EvidenceSettings = dataclasses.field(default_factory=EvidenceSettings)
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ...core.names import short_name
 from ..recording import Recording
 from .line import Line, Verdict, judged, limits_text, worst, worst_verdict
 from .tags import TagLimits, dwell_s
@@ -25,11 +26,6 @@ def radio_lines(recording: Recording, tags: list[TagLimits], thresholds: Thresho
     ]
 
 
-def short(epc: str) -> str:
-    """The end of an EPC, where those of one batch differ; short names stay whole."""
-    return epc if len(epc) <= 12 else f"…{epc[-6:]}"
-
-
 def _of_tags(
     tags: list[TagLimits],
     value: Callable[[TagLimits], float],
@@ -45,7 +41,7 @@ def _of_tags(
     if len(tags) == 1:
         return judged(values[0], limits), shown(float(values[0])), tags[0]
     good = sum(judged(one, limits) == "good" for one in known)
-    text = f"{shown(float(values[place]))} (tag {short(tags[place].epc)}, the worst); median {shown(float(np.median(known)))}; {good} of {len(known)} tags good"
+    text = f"{shown(float(values[place]))} (tag {short_name(tags[place].epc, '…')}, the worst); median {shown(float(np.median(known)))}; {good} of {len(known)} tags good"
     return judged(values[place], limits), text, tags[place]
 
 

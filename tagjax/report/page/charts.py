@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..overlay import short_name
+from ...core.names import short_name
 from .html import Html, element, together
 from .states import STATES, TagFrames, runs
 

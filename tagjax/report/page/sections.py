@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..overlay import short_name
+from ...core.names import short_name
 from ..video import read_video
 from .charts import Line, fraction_bar, line_chart, round_up, timeline
 from .contents import Contents

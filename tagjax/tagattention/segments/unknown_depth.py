@@ -38,7 +38,7 @@ from .step import SegmentFrame
 from .travel import Pooling
 
 _SHORTEST_FRAME_S = 1e-6
-_NEAREST_M = 0.05
+_NEAREST_M = 0.05  # a segment that is nearer is out of view
 _CARRIER_HZ = 915e6  # before the first read; no phase has been measured then
 
 
@@ -76,9 +76,9 @@ class RayMotion(eqx.Module):
 
     @staticmethod
     def of(centre_m: Float[Array, "segment 3"], motion_m: Float[Array, "segment 3"]) -> RayMotion:
-        """Of segments whose places and motions have a depth, such as a nominal one; nothing of the rate.
+        """From places and motions with a depth, which may be nominal. Nothing is measured of the rate.
 
-        A segment out of view has depth 0, and its ray says nothing. Nearer than `_NEAREST_M` nothing is seen: the rays stay finite.
+        A segment out of view has depth 0, and its ray means nothing, but has to be finite.
         """
         before = centre_m - motion_m
         ray, last = (one[:, :2] / jnp.where(one[:, 2:] > _NEAREST_M, one[:, 2:], 1.0) for one in (centre_m, before))

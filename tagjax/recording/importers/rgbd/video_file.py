@@ -10,6 +10,7 @@ import numpy as np
 
 from ....core.errors import RecordingError
 from ....core.names import valid_name
+from ...checks import FIRST_DATE_NS
 from ...video_files import check_whole, frame_time_ns, num_stated_frames, opened_video
 from .camera_file import find_camera_file, read_camera_file
 from .picture_folder import by_time, depth_folder, files_as_pictures
@@ -17,8 +18,6 @@ from .source import Picture, RgbdSource
 from .times import check_counts, picture_files, start_time_ns, timed_files
 
 ENDINGS = (".mp4", ".mov", ".avi", ".m4v")
-
-_DAY_NS = 86_400 * 10**9  # since 1970: earlier times are no dates
 
 
 def open_video(path: Path, camera_file: Path | None = None, start: str | float | None = None) -> RgbdSource:
@@ -62,7 +61,7 @@ def open_video(path: Path, camera_file: Path | None = None, start: str | float |
 
 def _on_clock(timed: list[tuple[int, Path]], start_ns: int | None) -> list[tuple[int, Path]]:
     """Times since the first frame, on the clock of `start_ns`; times of day as they are."""
-    if start_ns is None or start_ns < _DAY_NS or timed[0][0] >= _DAY_NS:
+    if start_ns is None or start_ns < FIRST_DATE_NS or timed[0][0] >= FIRST_DATE_NS:
         return timed
     return [(start_ns + time_ns, path) for time_ns, path in timed]
 
