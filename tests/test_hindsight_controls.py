@@ -136,17 +136,19 @@ def test_a_control_teaches_detection_its_true_slope_and_nothing_else(piece: Piec
 def test_detection_has_the_slope_that_the_whole_tracer_gives_it(piece: Piece) -> None:
     learnable, static = eqx.partition(TRACER, eqx.is_inexact_array)
 
-    settings = dataclasses.replace(SETTINGS, memory=0.9)
-
-    def slopes(alone: bool) -> Any:
+    def slopes(settings: HindsightSettings) -> Any:
         def wrong(values: Any) -> Any:
-            tracer = eqx.combine(values, static)
-            return hindsight_sums(tracer, piece.camera, piece.frames, settings, detection_alone=alone).wrong
+            return hindsight_sums(eqx.combine(values, static), piece.camera, piece.frames, settings).wrong
 
         return jax.jit(jax.grad(wrong))(learnable)
 
-    for one, other in zip(*(jax.tree.leaves(slopes(alone).detection) for alone in (False, True)), strict=True):
+    alone = dataclasses.replace(SETTINGS, memory=0.9)
+    found = [slopes(one) for one in (dataclasses.replace(alone, learn="all"), alone)]
+    for one, other in zip(*(jax.tree.leaves(each.detection) for each in found), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
+    for each in found:
+        others = eqx.tree_at(lambda one: one.detection, each, None)
+        assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(others))
 
 
 def test_files_hold_the_controls_and_are_the_same_each_time(piece: Piece, tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, PyTree
 
 from ...core.numerics import safe_divide
 from ...core.settings import ConfigError
-from ...tagattention.segments import TagAttention
+from ...tagattention.segments import Detection, TagAttention
+from ...tagattention.segments.detection import Explanations, RecentReads
 from ...tracing.tracer import AbstractTracer, Camera
 from ..fading import faded
 from .pieces import PieceFrames, frame_of
@@ -69,17 +70,16 @@ class HindsightSettings:
     ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
         """The loss of a piece, and what it consists of."""
         assert isinstance(tracer, TagAttention)
-        teaches_masks = self.learn != "confidence"
-        sums = hindsight_sums(tracer, camera, frames, self, detection_alone=not teaches_masks)
-        loss = safe_divide(sums.missed, sums.num_there) if teaches_masks else jnp.zeros(())
+        sums, loss = hindsight_sums(tracer, camera, frames, self), jnp.zeros(())
+        if self.learn != "confidence":
+            loss = loss + safe_divide(sums.missed, sums.num_there)
         if self.learn != "masks":
-            judged = hindsight_sums(tracer, camera, frames, self, detection_alone=True) if teaches_masks else sums
-            loss = loss + safe_divide(judged.wrong, judged.num_there + judged.num_away)
+            loss = loss + safe_divide(sums.wrong, sums.num_there + sums.num_away)
         logged = {
             "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
             "false_confidence": safe_divide(sums.claimed, sums.num_away),
         }
-        if frames.control is not None and self.needs_controls:
+        if frames.control is not None:
             strange = control_sums(tracer, camera, frames, self)
             loss = loss + self.controls / (1.0 - self.controls) * safe_divide(strange.wrong, strange.num)
             logged["false_confidence/control"] = safe_divide(strange.claimed, strange.num)
@@ -104,26 +104,38 @@ class ControlSums(NamedTuple):
     num: Float[Array, ""]
 
 
+class _Apart(eqx.Module):
+    """A detection, to whose inputs no gradient flows."""
+
+    stage: Detection
+
+    def received(self, state: RecentReads, arrivals: Any, *given: Array) -> RecentReads:
+        return self.stage.received(state, arrivals, *jax.lax.stop_gradient(given))
+
+    def confidence(self, nats: Explanations, recent: RecentReads) -> Array:
+        return self.stage.confidence(jax.lax.stop_gradient(nats), recent)
+
+    def __getattr__(self, name: str) -> Any:  # of the status, which has no gradient
+        return getattr(self.stage, name)
+
+
 def hindsight_sums(
-    tracer: TagAttention,
-    camera: Camera,
-    frames: PieceFrames,
-    settings: HindsightSettings,
-    *,
-    detection_alone: bool = False,
+    tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings
 ) -> HindsightSums:
     """The two questions of each tag-frame: where the object is, and how sure one may be of it.
 
     IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should be
     the probability that the mask is right, that is, of an IoU above 0.3: its squared error is least where it is (a
-    proper score; Brier, 1950). The mask does not depend on detection, so it teaches every other stage. With `detection_alone`
-    the others get no gradient: the confidence must not teach them.
+    proper score; Brier, 1950). The mask does not depend on detection, so it teaches every other stage; the confidence carries no
+    gradient to what detection is given, so it teaches detection alone. Where that is all that learns, no other backward pass is made.
     """
-    if detection_alone:
+    if settings.learn == "confidence":
         overlap, confidence, size = _of_detection(tracer, camera, frames, settings.memory)
     else:
-        before = lambda state: faded(state, settings.memory)  # noqa: E731
-        overlap, confidence, size = _scanned(tracer, camera, frames, before, jax.checkpoint)
+        apart = eqx.tree_at(lambda one: one.detection, tracer, replace_fn=_Apart)
+        overlap, confidence, size = _scanned(
+            apart, camera, frames, lambda state: faded(state, settings.memory), jax.checkpoint
+        )
     there = frames.present & (frames.confidence > settings.sure) & (size > 0)
     away = frames.present & (frames.confidence < 1.0 - settings.sure)
     right = jnp.where(there & (overlap > _RIGHT), 1.0, 0.0)
