@@ -277,7 +277,6 @@ def training(contents: Contents) -> Html | None:
             steps,
             [Line("loss", 0, loss)],
             x_label="step",
-            top=float(loss.max()),
             bottom=float(min(loss.min(), 0.0)),
         )
         parts.append(element("div", chart, class_="charts"))
