@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_segment_tracer import EPCS, scene
@@ -15,9 +17,11 @@ from tagjax.core.settings import ConfigError
 from tagjax.evaluation.view import ViewConfig, view_recording
 from tagjax.recording.store import save_recording
 from tagjax.report import viewer
+from tagjax.report.motion_error import MotionError
 from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.tracing.clips import ClipSettings, clip_loader
 from tagjax.tracing.recordings import trace_recording
+from tagjax.tracing.tracer import Trace
 
 TRACER = {"_target_": "tagjax.tagattention.TagAttention", "segments": {"segmenter": {"num_segments": 256}}}
 CLIPS = {"stride": 1, "flow": "zero"}
@@ -44,6 +48,19 @@ def _logged(file: Path, entity: str) -> list[Any]:
             times = np.asarray(batch.column("time").cast("int64"))
             rows += zip(times.tolist(), batch.column(name).to_pylist(), strict=True)
     return sorted(rows, key=lambda row: row[0])
+
+
+def _image_sizes(file: Path, entity: str) -> set[tuple[int, int]]:
+    """Widths and heights of the images of an entity."""
+    from rerun.chunk import RrdReader
+
+    sizes = set()
+    for chunk in RrdReader(file).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if chunk.entity_path == entity and name.endswith(":format"):
+                sizes |= {(one[0]["width"], one[0]["height"]) for one in batch.column(name).to_pylist() if one}
+    return sizes
 
 
 def _num_chunks(file: Path, entity: str) -> int:
@@ -78,6 +95,13 @@ def test_the_file_holds_reads_pictures_and_what_was_traced(path: Path, tmp_path:
             nats = [value[0] for _, value in _logged(out, f"/evidence/{epc}/{name}")]
             np.testing.assert_allclose(nats, [getattr(trace.evidence, name)[tag] for _, trace in traces])
         assert len(_logged(out, f"/log_odds/{epc}")) == 40
+        low, middle, high = (
+            {time: value[0] for time, value in _logged(out, f"/distance/{epc}{edge}") if type(value[0]) is float}
+            for edge in ("/low", "", "/high")
+        )
+        assert len(middle) == sum(bool(trace.detected[tag]) for _, trace in traces)
+        assert all(high[time] - one == pytest.approx(one - low[time]) for time, one in middle.items())
+        assert max(high[time] - one for time, one in middle.items()) < 0.1
     assert len(_logged(out, "/camera/picture/masks")) == 40
     assert any("detected" in value[0] for _, value in _logged(out, "/status"))
 
@@ -85,8 +109,57 @@ def test_the_file_holds_reads_pictures_and_what_was_traced(path: Path, tmp_path:
 def test_log_odds_are_shown_in_whole_nats() -> None:
     nats = np.array([[-30.0, -8.4, -1.2, 0.0], [0.4, 2.6, 7.6, 30.0]])
     classes = viewer.log_odds_classes((1.0 / (1.0 + np.exp(-nats))).astype(np.float32))
-    assert classes.tolist() == [[1, 1, 8, 9], [9, 12, 17, 17]]
-    assert viewer.log_odds_classes(np.array([[0.0, 1.0]], np.float32)).tolist() == [[0, 17]]
+    assert classes.tolist() == [[0, 0, 7, 8], [8, 11, 16, 16]]
+    assert viewer.log_odds_classes(np.array([[0.0, 1.0]], np.float32)).tolist() == [[0, 16]]
+    assert [number for number, _, _ in viewer._log_odds_classes()] == list(range(17))
+    assert viewer._log_odds_classes()[8][1] == "+0 nats"
+
+
+def test_pictures_are_small_unless_asked_for(path: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    made = {}
+    for full_size in (False, True):
+        folder = tmp_path / str(full_size)
+        folder.mkdir()
+        config = ViewConfig(
+            recording=str(path), tracer=TRACER, clips={**CLIPS, "stride": 2}, frames=(0, 20), full_size=full_size
+        )
+        made[full_size] = view_recording(config, folder)
+    height, width = scene(40).intrinsics.height, scene(40).intrinsics.width
+    for full_size, out in made.items():
+        assert out is not None
+        divided = 1 if full_size else 2
+        (picture,) = _logged(out, "/camera/picture")[0][1]
+        shape = cv2.imdecode(np.frombuffer(bytes(picture), np.uint8), cv2.IMREAD_COLOR).shape
+        assert shape == (height // divided, width // divided, 3)
+        assert _image_sizes(out, "/camera/picture/masks") == {(width // divided, height // divided)}
+        (odds,) = _image_sizes(out, f"/log_odds/{next(iter(EPCS))}")
+        assert odds == (width // (2 * divided), height // (2 * divided))
+
+
+def test_a_quality_that_is_none_is_refused(path: Path) -> None:
+    with pytest.raises(ConfigError, match="quality is 0; expected a value from 1 to 100"):
+        ViewConfig(recording=str(path), tracer=TRACER, quality=0)
+
+
+def test_a_band_grows_with_the_way_and_is_forgotten() -> None:
+    error = MotionError(drift_m=1e-4, memory_s=4.0)
+
+    def frame(step_m: float) -> Trace:
+        return Trace(
+            mask=jnp.zeros((2, 1, 1)),
+            box_px=jnp.zeros((2, 4)),
+            centre_px=jnp.zeros((2, 2)),
+            centre_m=jnp.array([[0.5, 0.0, 2.0]] * 2),
+            step_m=jnp.array([[step_m], [0.0]]),
+            confidence=jnp.zeros(2),
+            detected=jnp.zeros(2, bool),
+        )
+
+    np.testing.assert_allclose(error.after(0.0, frame(0.0)), [0.0, 0.0])
+    np.testing.assert_allclose(error.after(0.1, frame(-0.25)), [0.01, 0.0])  # sqrt(1e-4 * 2^2 * 0.25)
+    np.testing.assert_allclose(error.after(4.1, frame(0.0)), [0.01 * np.exp(-0.5), 0.0], rtol=1e-6)
+    np.testing.assert_allclose(error.after(4.1, frame(np.nan)), [0.01 * np.exp(-0.5), 0.0], rtol=1e-6)
 
 
 def test_a_missing_package_is_reported_before_the_work(
