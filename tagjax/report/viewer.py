@@ -231,13 +231,14 @@ def _log_tags(
     places, detected = np.asarray(trace.centre_m), np.asarray(trace.detected)
     for tag, epc in enumerate(epcs):
         stream.log(_of(epc, "confidence"), rr.Scalars(float(trace.confidence[tag])))
-        if not detected[tag]:
-            for name in (f"/places/{epc}", _of(epc, "distance")):  # so that no line crosses the gap
-                stream.log(name, rr.Clear(recursive=True))
-            continue
-        colour = PALETTE_RGB[tag % len(PALETTE_RGB)]
-        stream.log(f"/places/{epc}", rr.Points3D([places[tag]], labels=[short_name(epc)], radii=0.04, colors=colour))
-        metres = float(np.linalg.norm(places[tag] - recording.antennas_m[antennas[0] - 1]))
+        metres = np.nan  # without a detection, so that no line crosses the gap
+        if detected[tag]:
+            colour = PALETTE_RGB[tag % len(PALETTE_RGB)]
+            point = rr.Points3D([places[tag]], labels=[short_name(epc)], radii=0.04, colors=colour)
+            stream.log(f"/places/{epc}", point)
+            metres = float(np.linalg.norm(places[tag] - recording.antennas_m[antennas[0] - 1]))
+        else:
+            stream.log(f"/places/{epc}", rr.Clear(recursive=False))
         stream.log(_of(epc, "distance"), rr.Scalars(metres))
         if error_m is None:
             continue
