@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,18 +54,19 @@ def examples(sources: Sources, items: list[Item], path: Path) -> str:
 
 
 def several(sources: Sources, items: list[Item], path: Path) -> str:
-    """Fig. 15: both tracers with two objects and with four, two of them alike."""
+    """Fig. 15: both tracers with two objects and with four, two of them alike: the first recording of each, numbers of all."""
     rows: list[Row] = []
     lines: list[Line] = []
     told: list[str] = []
-    for item in items:
+    for item, *more in _by_variant(items):
         recording = sources.recording(item)
         for name in (LEARNABLE, PUBLISHED):
             traced = sources.traced(sources.system(name), item)
             frames = _after_motion(traced, _MULTI_SINCE)
             label = f"{len(traced.frames)} objects\n{_SHORT[name]}"
             rows.append(_row(label, recording, traced, frames, lines, item, name))
-            told.append(f"{len(traced.frames)} objects, {_SHORT[name]} {_identified(traced):.2f}")
+            own = [_identified(one.frames) for one in (traced, *_without_pictures(sources, name, more))]
+            told.append(f"{len(traced.frames)} objects, {_SHORT[name]} {np.mean(np.concatenate(own)):.2f}")
     count = max(len(row.cells[0].masks) for row in rows)
     strip_figure(path, rows, names=[f"tag {number}" for number in range(1, count + 1)])
     _write(path, lines)
@@ -73,26 +74,37 @@ def several(sources: Sources, items: list[Item], path: Path) -> str:
 
 
 def blocked(sources: Sources, items: list[Item], path: Path) -> str:
-    """Fig. 20: both tracers before, while and after something covers the object."""
-    item = items[0]
-    recording = sources.recording(item)
-    traces = {name: sources.traced(sources.system(name), item, whole=True) for name in (LEARNABLE, PUBLISHED)}
-    epc = next(iter(traces[PUBLISHED].frames))
-    frames, titles = _around_blockage(recording, epc)
+    """Fig. 20: both tracers before, while and after something covers the object: the first recording, numbers of all."""
     rows: list[Row] = []
     lines: list[Line] = []
-    for name, traced in traces.items():
-        rows.append(_row(_SHORT[name], recording, traced, frames, lines, item, name, titles))
+    told: list[str] = []
+    for name in (LEARNABLE, PUBLISHED):
+        waits_s = []
+        for item in items:
+            recording = sources.recording(item)
+            traced = sources.traced(sources.system(name), item, pictures=item is items[0], whole=True)
+            epc, scores = next(iter(traced.frames.items()))
+            frames, titles = _around_blockage(recording, epc)
+            if item is items[0]:
+                rows.append(_row(_SHORT[name], recording, traced, frames, lines, item, name, titles))
+            waits_s.append(_recovery_s(scores, frames[-3], recording))
+        soon = int(np.sum(np.array(waits_s) <= 1.0))
+        told.append(f"{_SHORT[name]} {soon} of {len(items)} ({_wait_text(waits_s[0])} in the one shown)")
     strip_figure(path, rows)
     _write(path, lines)
-    told = [f"{_SHORT[name]} {_recovery(traced.frames[epc], frames[-3], recording)}" for name, traced in traces.items()]
-    return f"{item.name}. After the object is in view again: {'; '.join(told)}."
+    return (
+        f"Shown: {items[0].name}. Recordings in which the box IoU is 0.5 again within a second of the object's being in view "
+        f"again: {'; '.join(told)}."
+    )
 
 
 def alike(sources: Sources, items: list[Item], path: Path) -> str:
-    """Fig. 21: two objects in one grip, read by one antenna (both tracers), and by two (the learnable one)."""
+    """Fig. 21: two objects in one grip, read by one antenna (both tracers), and by two (the learnable one).
+
+    The first recording of each, numbers of all.
+    """
     learnable = sources.config.tracers[LEARNABLE]
-    one, two = items
+    one, two = _by_variant(items)
     runs = (
         ("published,\none antenna", sources.system(PUBLISHED), one),
         ("learnable,\none antenna", sources.system(LEARNABLE), one),
@@ -101,18 +113,35 @@ def alike(sources: Sources, items: list[Item], path: Path) -> str:
     rows: list[Row] = []
     lines: list[Line] = []
     told: list[str] = []
-    for label, system, item in runs:
-        traced, recording = sources.traced(system, item), sources.recording(item)
-        rows.append(_row(label, recording, traced, _after_motion(traced, (20, 40, 60, 85)), lines, item, system.name))
-        own, both, same = _as_one(recording, traced)
+    for label, system, own in runs:
+        means = []
+        for item in own:
+            traced, recording = sources.traced(system, item), sources.recording(item)
+            means.append(_as_one(recording, traced))
+            if item is own[0]:
+                frames = _after_motion(traced, (20, 40, 60, 85))
+                rows.append(_row(label, recording, traced, frames, lines, item, system.name))
+        alone, both, same = np.nanmean(means, axis=0).tolist()
         plain = label.replace("\n", " ")
         told.append(
-            f"{plain}: box IoU {own:.2f} with the tag's own object, {both:.2f} with both as one, {same:.2f} of the frames with "
+            f"{plain}: box IoU {alone:.2f} with the tag's own object, {both:.2f} with both as one, {same:.2f} of the frames with "
             "one mask for both tags"
         )
     strip_figure(path, rows, names=("tag 1", "tag 2"))
     _write(path, lines)
     return f"From frame 40 after the first motion: {'; '.join(told)}. Neither tracer compares RSSI with positions."
+
+
+def _by_variant(items: Sequence[Item]) -> list[list[Item]]:
+    """The recordings of each suite's variant, in the order of their first ones."""
+    groups: dict[tuple[str, str], list[Item]] = {}
+    for item in items:
+        groups.setdefault((item.suite.name, item.variant.name), []).append(item)
+    return list(groups.values())
+
+
+def _without_pictures(sources: Sources, name: str, items: Sequence[Item]) -> list[Traced]:
+    return [sources.traced(sources.system(name), item, pictures=False) for item in items]
 
 
 def _place(item: Item) -> str:
@@ -192,10 +221,9 @@ def _fall(traced: Traced) -> tuple[float, int]:
     return float(fall[at]), at + 2
 
 
-def _identified(traced: Traced) -> float:
-    own = [one.detected & (one.identified == one.label) for one in traced.frames.values()]
-    counted = np.concatenate(own)[np.concatenate([one.valid for one in traced.frames.values()])]
-    return float(np.mean(counted)) if len(counted) else float("nan")
+def _identified(frames: Mapping[str, FrameScores]) -> np.ndarray:
+    """Of every tag's frames that count: whether its own object is identified."""
+    return np.concatenate([(one.detected & (one.identified == one.label))[one.valid] for one in frames.values()])
 
 
 def _around_blockage(recording: Recording, epc: str) -> tuple[list[int], list[str]]:
@@ -222,14 +250,15 @@ def _around_blockage(recording: Recording, epc: str) -> tuple[list[int], list[st
     return [before, half, least, again, *later], titles
 
 
-def _recovery(one: FrameScores, again: int, recording: Recording) -> str:
-    """The time from a frame to the first of three frames in a row with a box IoU of 0.5."""
-    good = one.box_iou >= 0.5
-    for frame in range(again, len(good) - 2):
-        if good[frame : frame + 3].all():
-            time_s = recording.frame_time_s()
-            return f"box IoU 0.5 again after {time_s[frame] - time_s[again]:.1f} s"
-    return "box IoU 0.5 not reached again"
+def _recovery_s(one: FrameScores, again: int, recording: Recording) -> float:
+    """The time from a frame to the first of three frames in a row with a box IoU of 0.5; infinite without them."""
+    good, time_s = one.box_iou >= 0.5, recording.frame_time_s()
+    found = (frame for frame in range(again, len(good) - 2) if good[frame : frame + 3].all())
+    return next((float(time_s[frame] - time_s[again]) for frame in found), np.inf)
+
+
+def _wait_text(wait_s: float) -> str:
+    return f"after {wait_s:.1f} s" if np.isfinite(wait_s) else "not at all"
 
 
 def _as_one(recording: Recording, traced: Traced) -> tuple[float, float, float]:

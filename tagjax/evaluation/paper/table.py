@@ -117,7 +117,7 @@ FIGURES: dict[str, PaperFigure] = {
     "15": PaperFigure(
         TAGATTENTION,
         15,
-        (Recordings("multi_2", one=True), Recordings("multi_4", one=True)),
+        (Recordings("multi_2"), Recordings("multi_4")),
         strips.several,
         "Two objects, and four objects of which two bottles look alike (white and dashed: the true boxes).",
         "At the 5th frame nothing is detected; later each object has its mask and ID, also the two bottles that look alike.",
@@ -142,7 +142,7 @@ FIGURES: dict[str, PaperFigure] = {
     "20": PaperFigure(
         TAGATTENTION,
         20,
-        (Recordings("occlusion", one=True),),
+        (Recordings("occlusion"),),
         strips.blocked,
         "A notebook passes between the camera and the object (white and dashed: the true box of what is in view).",
         "Partly covered: the visible part and the body; fully covered: nothing; captured again about one second after the notebook is gone.",
@@ -150,7 +150,7 @@ FIGURES: dict[str, PaperFigure] = {
     "21": PaperFigure(
         TAGATTENTION,
         21,
-        (Recordings("co_moving", one=True),),
+        (Recordings("co_moving"),),
         strips.alike,
         "Two objects in one grip that move as one, read by one antenna, and by two in turn (white and dashed: the true boxes).",
         "Both objects are highlighted and recognised as one whole target.",
