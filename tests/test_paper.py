@@ -295,7 +295,7 @@ def test_the_page_keeps_the_figures_of_runs_before(tmp_path: Path):
 
 @pytest.mark.ci
 @pytest.mark.parametrize(
-    "names", [("2", "3"), ("4", "5", "6", "7", "11"), ("14", "15"), ("21",), ("tagview_7", "tagview_9")]
+    "names", [("2", "3"), ("4", "5", "6", "7", "11"), ("14", "15"), ("20", "21"), ("tagview_7", "tagview_9")]
 )
 def test_figures_are_drawn_from_suites_in_small(tmp_path: Path, names: tuple[str, ...]):
     pytest.importorskip("mujoco")

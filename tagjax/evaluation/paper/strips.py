@@ -66,7 +66,7 @@ def several(sources: Sources, items: list[Item], path: Path) -> str:
             label = f"{len(traced.frames)} objects\n{_SHORT[name]}"
             rows.append(_row(label, recording, traced, frames, lines, item, name))
             own = [_identified(one.frames) for one in (traced, *_without_pictures(sources, name, more))]
-            told.append(f"{len(traced.frames)} objects, {_SHORT[name]} {np.mean(np.concatenate(own)):.2f}")
+            told.append(f"{len(traced.frames)} objects, {_SHORT[name]} {_mean(np.concatenate(own)):.2f}")
     count = max(len(row.cells[0].masks) for row in rows)
     strip_figure(path, rows, names=[f"tag {number}" for number in range(1, count + 1)])
     _write(path, lines)
@@ -121,7 +121,7 @@ def alike(sources: Sources, items: list[Item], path: Path) -> str:
             if item is own[0]:
                 frames = _after_motion(traced, (20, 40, 60, 85))
                 rows.append(_row(label, recording, traced, frames, lines, item, system.name))
-        alone, both, same = np.nanmean(means, axis=0).tolist()
+        alone, both, same = (_mean(np.array(one)) for one in zip(*means, strict=True))
         plain = label.replace("\n", " ")
         told.append(
             f"{plain}: box IoU {alone:.2f} with the tag's own object, {both:.2f} with both as one, {same:.2f} of the frames with "
@@ -138,6 +138,12 @@ def _by_variant(items: Sequence[Item]) -> list[list[Item]]:
     for item in items:
         groups.setdefault((item.suite.name, item.variant.name), []).append(item)
     return list(groups.values())
+
+
+def _mean(values: np.ndarray) -> float:
+    """Of those that are numbers; NaN where none is."""
+    known = values[np.isfinite(values)]
+    return float(np.mean(known)) if known.size else float("nan")
 
 
 def _without_pictures(sources: Sources, name: str, items: Sequence[Item]) -> list[Traced]:
