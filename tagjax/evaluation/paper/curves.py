@@ -31,7 +31,7 @@ def all_and_each(sources: Sources, items: list[Item], path: Path) -> str:
     lines = _both(sources, items)
     by_variant = _by_variant(items)
     each = {name: _curves(sources, sources.system(LEARNABLE), own) for name, own in by_variant.items()}
-    panels = [Panel("mean of all", lines), Panel("learnable, by object", each)]
+    panels = [Panel("mean of all", lines), Panel("learnable, by object", each, bands=False)]
     return _draw(path, panels, stated=panels[:1])
 
 

@@ -21,10 +21,11 @@ SCORES = {"iou": "box IoU", "cle_px": "CLE (px of 512)"}
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """A column of panels: its title, and by line the curves of each score."""
+    """A column of panels: its title, and by line the curves of each score. Bands of many lines would hide each other."""
 
     title: str
     lines: Mapping[str, Mapping[str, Curve]]
+    bands: bool = True
 
 
 def shown(curve: Curve) -> Bool[np.ndarray, " frame"]:
@@ -51,7 +52,8 @@ def score_figure(path: Path, panels: Sequence[Panel], *, scores: Sequence[str] =
                 frame, mean, low, high = _drawn(by_score[score], kept)
                 colour, dash = LINES[number % len(LINES)], DASHES[number % len(DASHES)]
                 axes.plot(frame, mean, color=colour, linestyle=dash, linewidth=1.4, label=name)
-                axes.fill_between(frame, low, high, color=colour, alpha=0.16, linewidth=0)
+                if panel.bands:
+                    axes.fill_between(frame, low, high, color=colour, alpha=0.16, linewidth=0)
             tidy(axes, title=panel.title if row == 0 else "", ylabel=SCORES[score] if column == 0 else "")
             axes.set_xlim(0, NUM_FRAMES)
     for score, row in zip(scores, grid, strict=True):  # when all is drawn: panels of a row share their limits
