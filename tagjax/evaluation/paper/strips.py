@@ -93,8 +93,8 @@ def blocked(sources: Sources, items: list[Item], path: Path) -> str:
     strip_figure(path, rows)
     _write(path, lines)
     return (
-        f"Shown: {items[0].name}. Recordings in which the box IoU is 0.5 again within a second of the object's being in view "
-        f"again: {'; '.join(told)}."
+        f"Shown: {items[0].name}. Recordings in which the box IoU reaches 0.5 again within a second after the object is back in "
+        f"view: {'; '.join(told)}."
     )
 
 
