@@ -48,6 +48,8 @@ class Memory:
             tolerance = s["constant_m"] + s["quadratic"] * z * z
             still = float(np.hypot(*flow[at].astype(float))) * z < s["still_m_s"] * focal * dt
             matched = ok and abs(z - p["c"]) < tolerance
+            if ok and p["rested"] > 0 and p["rested"] + tolerance < z < 2 * p["rested"] + 1:
+                p["rested"] = 0.0
             if matched and still:
                 p["n"] = min(p["n"] + 1, 100)
                 p["c"] += (z - p["c"]) / p["n"]

@@ -92,3 +92,16 @@ def test_the_place_where_an_object_stood_is_background_soon_after_it_has_left() 
     np.testing.assert_array_equal(history[123][0], 0)
     np.testing.assert_allclose(history[123][1], 2.0, atol=5e-3)
     assert (history[124][0][1:-1, 1:-1] > 0).all()  # it comes back as something new
+
+
+def test_a_person_who_walks_away_is_not_taken_for_the_surface_that_was_at_rest_there() -> None:
+    model, shape, dt = Background(), (4, 6), 0.1
+    state, step = model.init(*shape), eqx.filter_jit(model.step)
+    still, valid = jnp.zeros((*shape, 2)), jnp.ones(shape, bool)
+    for t in range(40):
+        depth = jnp.full(shape, 3.0 if t < 10 else min(3.0 + 0.1 * (t - 9), 4.5))
+        state, view = step(state, depth, valid, still, scalar(dt), scalar(200.0))
+        if 12 <= t < 25:
+            assert bool(view.front.all()), t
+    assert not bool(view.front.any())  # the wall at 4.5 m, at rest
+    np.testing.assert_allclose(state.rested_m, 4.5, atol=1e-3)

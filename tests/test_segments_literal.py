@@ -27,7 +27,15 @@ PIXELS = SegmentTracker(
 )
 EVIDENCE = AttentionEvidence(VelocityGate(threshold_m_s=0.1, width_m_s=1e-7), floor=FLOOR, memory_s=None)
 ON_SEGMENTS = TagAttention(
-    segments=PIXELS, travel=None, dwell=None, attention=EVIDENCE, body=None, whole=None, hidden=None, free=None
+    segments=PIXELS,
+    travel=None,
+    dwell=None,
+    attention=EVIDENCE,
+    body=None,
+    competition=None,
+    whole=None,
+    hidden=None,
+    free=None,
 )
 LITERAL = TagAttentionLiteral(refine=False)
 

@@ -46,12 +46,19 @@ def test_a_body_that_does_not_travel_stays_as_it_is():
     assert float(WholeBody().completed(still, found, moved, ELAPSED)[0, 3]) < 0.1
 
 
-def test_a_gap_ends_the_body():
+@pytest.mark.parametrize(("axis", "gap_m"), [(1, 0.2), (0, 0.2), (2, 0.2)])
+def test_a_gap_ends_the_body(axis: int, gap_m: float):
     found, moved = person()
-    found = eqx.tree_at(lambda one: one.centre_m, found, found.centre_m.at[5:7, 1].add(0.3))
+    found = eqx.tree_at(lambda one: one.centre_m, found, found.centre_m.at[5:7, axis].add(gap_m))
     after = np.asarray(WholeBody().completed(trunk(), found, moved, ELAPSED))[0]
     assert (after[1:5] > 0.9).all()
     assert (after[5:7] < 0.05).all()
+
+
+def test_dark_clothes_without_depth_leave_a_gap_in_an_upright_body():
+    found, moved = person()
+    found = eqx.tree_at(lambda one: one.centre_m, found, found.centre_m.at[5:7, 1].add(0.12))
+    assert (np.asarray(WholeBody().completed(trunk(), found, moved, ELAPSED))[0, 1:7] > 0.9).all()
 
 
 def test_a_young_segment_that_is_connected_belongs_to_a_body_that_travels():

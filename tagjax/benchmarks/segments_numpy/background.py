@@ -78,7 +78,10 @@ class Background:
         revealed = self.deeper_s > max(self.reveal_s, np.float32(original._REVEAL_FRAMES) * dt_s)
         np.copyto(confirmed, np.float32(0), where=revealed)
         shown = valid & (confirmed > 0) & (np.abs(depth_m - confirmed) < tolerance)
-        np.maximum(self.rested_m, candidate, out=self.rested_m, where=seen & (age > self.early_s))
-        front = valid & ((self.rested_m <= 0) | (depth_m < self.rested_m - 2 * tolerance))
+        rested = self.rested_m
+        gone = valid & (rested > 0) & (depth_m > rested + tolerance) & (depth_m < 2 * rested + 1)
+        np.copyto(rested, np.float32(0), where=gone)
+        np.maximum(rested, candidate, out=rested, where=seen & (age > self.early_s))
+        front = valid & ((rested <= 0) | (depth_m < rested - 2 * tolerance))
         self.started |= bool(valid.any())
         return View(confirmed=shown, matched=matched, age_s=age, still=still, front=front)

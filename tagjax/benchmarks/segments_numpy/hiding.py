@@ -32,7 +32,8 @@ class Whole:
         at = at[found.exists[at]]
         if not len(at):
             return
-        body = connected(touching(found.centre_m[at], found.size_m[at]), joins[at] > 0.5)
+        flat = found.centre_m * np.array([1, whole._UPRIGHT, 1], np.float32)
+        body = connected(touching(flat[at], found.size_m[at]), joins[at] > 0.5)
         weight = membership * found.area
         total = weight.sum(axis=1)
         members = (body[:, None] == np.arange(len(at))[None]).astype(np.float32)
@@ -101,12 +102,14 @@ class Hidden:
         velocity_m_s: np.ndarray,
         kept: np.float32,
         dt_s: np.float32,
+        rival_nats: np.ndarray | None,
     ) -> Bool[np.ndarray, " tag"]:
         """Which last bodies are remembered after a frame."""
         nothing, v = np.float32(hidden._NOTHING), self.value
         body_nats = np.where(in_view, body_nats, nothing)
         remembered = np.where(self.evidence_nats > 0.5 * nothing, kept * self.evidence_nats, nothing)
-        kept_on = remembered > body_nats + v["margin_nats"]
+        in_view_nats = body_nats if rival_nats is None else np.maximum(body_nats, rival_nats)
+        kept_on = remembered > in_view_nats + v["margin_nats"]
         gone, (place_m, slowed_m_s) = kept_on[:, None], self.predicted(dt_s)
         self.evidence_nats = np.where(kept_on, remembered, body_nats)
         self.centre_m = np.where(gone, place_m, centre_m)

@@ -13,6 +13,7 @@ from ...tagattention.segments.labels import STATIC
 from ...tracing.tracer import Camera, Frame
 from .background import Background, on_surface
 from .body import Body, sigmoid
+from .competition import Competition
 from .hiding import Hidden, Whole
 from .labels import Labels
 from .motion import segment_motion
@@ -59,6 +60,9 @@ class NumpyTracer:
         self.travel = None if tracer.travel is None else Travel(tracer.travel, num)
         self.dwells = Dwells(tracer.dwell, tracer.reader, num_tags, len(self.antennas_m), num)
         self.body = Body(tracer.body, num_tags, num)
+        self.competition = None
+        if tracer.competition is not None:
+            self.competition = Competition(tracer.competition, self.body.value["temperature_nats"], num_tags, num)
         self.whole = None if tracer.whole is None else Whole(tracer.whole)
         self.hidden = None if tracer.hidden is None else Hidden(tracer.hidden, num_tags)
         self.free = None
@@ -140,7 +144,13 @@ class NumpyTracer:
             self.hidden.inherit(nats, found)
         if self.travel is not None and pooling is not None:
             self.travel.heal(pooling, nats, dt_s)
-        log_odds, place = self.body.step(nats - nats[:, :1], found, since_s, now_s)
+        evidence = nats - nats[:, :1]
+        rival_nats = None
+        if self.competition is not None:
+            bodies = self.competition.bodies(found, present)
+            rival_nats = bodies.evidence_of(nats).max(axis=1)
+            evidence += self.competition.prior_nats(bodies, evidence)
+        log_odds, place = self.body.step(evidence, found, since_s, now_s)
         membership = sigmoid(log_odds)
         if self.whole is not None:
             moved = self.body.past.since(self.whole.lag_s, found.displacement_m, found.life_s, now_s)
@@ -160,7 +170,7 @@ class NumpyTracer:
             kept = np.exp(-dt_s / self.dwells.memory_s)
             hides = self.hidden.out_of_view(self.rays, np.asarray(frame.depth_m), labels, membership, dt_s)
             velocity_m_s = motion_m / max(dt_s, np.float32(1e-3))
-            hides &= self.hidden.step(body_nats, some, centre_m, velocity_m_s, kept, dt_s)
+            hides &= self.hidden.step(body_nats, some, centre_m, velocity_m_s, kept, dt_s, rival_nats)
         free_nats = free_added = np.zeros(len(total), np.float32)
         if self.free is not None:
             free_added = self.free.step(arrivals, self.dwells.memory_s, since_s, now_s)
@@ -168,4 +178,7 @@ class NumpyTracer:
         self.confidence.received(arrivals, free_added, since_s, now_s)
         confidence = self.confidence.of(body_nats, nats[:, STATIC], free_nats)
         shown = present & (membership > 0.5).any(axis=1) & ~hides
-        return membership, np.where(shown, confidence, np.float32(0))
+        confidence = np.where(shown, confidence, np.float32(0))
+        if self.competition is not None:
+            self.competition.membership, self.competition.confidence = membership, confidence
+        return membership, confidence

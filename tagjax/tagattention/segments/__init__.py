@@ -4,6 +4,7 @@ from .association import SegmentTrace as SegmentTrace
 from .background import Background as Background
 from .body import Bodies as Bodies
 from .body import CarryingBody as CarryingBody
+from .competition import Competition as Competition
 from .detection import Detection as Detection
 from .dwell import DwellEvidence as DwellEvidence
 from .free_path import FreePath as FreePath

@@ -28,7 +28,7 @@ class BackgroundState(eqx.Module):
     count: Float[Array, "height width"]  # frames in that mean
     age_s: Float[Array, "height width"]  # time for which the candidate was seen at rest
     confirmed_m: Float[Array, "height width"]
-    rested_m: Float[Array, "height width"]  # the deepest surface seen at rest for `early_s`
+    rested_m: Float[Array, "height width"]  # the deepest surface seen at rest for `early_s`; 0 once a deeper one shows
     deeper_s: Float[Array, "height width"]  # time for which a surface behind the confirmed one is seen
     started: Bool[Array, ""]  # a frame with depth has been seen
 
@@ -111,14 +111,16 @@ class Background(eqx.Module):
         nearer = (state.confirmed_m > 0) & (candidate < state.confirmed_m - tolerance)
         ripe = seen & (age >= jnp.where(nearer, _NEARER_FACTOR * self.confirm_s, self.confirm_s))
         confirmed = jnp.where(ripe, candidate, state.confirmed_m)
-        # More than twice as deep is a wrong measurement more often than a view through.
-        behind = (depth_m > confirmed + tolerance) & (depth_m < 2.0 * confirmed + 1.0)
-        deeper = valid & (confirmed > 0) & behind
+        deeper = valid & (confirmed > 0) & _behind(depth_m, confirmed, tolerance)
         deeper_s = jnp.where(deeper, state.deeper_s + dt_s, jnp.where(valid, 0.0, state.deeper_s))
         revealed = deeper_s > jnp.maximum(self.reveal_s, _REVEAL_FRAMES * dt_s)
         confirmed = jnp.where(revealed, 0.0, confirmed)
 
-        rested = jnp.where(seen & (age > self.early_s), jnp.maximum(state.rested_m, candidate), state.rested_m)
+        # A surface behind what was seen at rest shows that this was an object, which has gone: a person who walks away.
+        last = state.rested_m
+        gone = valid & (last > 0) & _behind(depth_m, last, tolerance)
+        last = jnp.where(gone, 0.0, last)
+        rested = jnp.where(seen & (age > self.early_s), jnp.maximum(last, candidate), last)
         # Both depths have their error.
         front = valid & ((rested <= 0) | (depth_m < rested - 2.0 * tolerance))
         known = valid & (state.confirmed_m > 0)
@@ -135,3 +137,12 @@ class Background(eqx.Module):
         )
         started = state.started | jnp.any(valid)
         return BackgroundState(candidate, count, age, confirmed, rested, deeper_s, started), view
+
+
+def _behind(
+    depth_m: Float[Array, "height width"],
+    surface_m: Float[Array, "height width"],
+    tolerance_m: Float[Array, "height width"],
+) -> Bool[Array, "height width"]:
+    """Whether the depth is behind a surface; more than twice as deep is a wrong measurement more often than a view past it."""
+    return (depth_m > surface_m + tolerance_m) & (depth_m < 2.0 * surface_m + 1.0)

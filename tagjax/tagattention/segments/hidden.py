@@ -106,15 +106,18 @@ class HiddenBody(eqx.Module):
         velocity_m_s: Float[Array, "tag 3"],
         kept: Float[Array, ""],
         dt_s: Float[Array, ""],
+        rival_nats: Float[Array, " tag"] | None = None,
     ) -> tuple[HiddenState, Bool[Array, " tag"]]:
         """The state after a frame, and which last bodies are remembered: those with more evidence than the best in view.
 
         `body_nats`, `centre_m` and `velocity_m_s` are those of the best body in view, if any is; `kept` is what evidence keeps of its
-        value from the last frame to this one.
+        value from the last frame to this one. `rival_nats` is the best evidence for a body of any tag that is in view: a last body
+        that explains the reads as well may be that one, which this tag has left to another.
         """
         body_nats = jnp.where(in_view, body_nats, _NOTHING)
         remembered = jnp.where(state.evidence_nats > 0.5 * _NOTHING, kept * state.evidence_nats, _NOTHING)
-        kept_on = remembered > body_nats + self.margin_nats.value
+        in_view_nats = body_nats if rival_nats is None else jnp.maximum(body_nats, rival_nats)
+        kept_on = remembered > in_view_nats + self.margin_nats.value
         place_m, slowed_m_s = self.predicted(state, dt_s)
         after = HiddenState(
             evidence_nats=jnp.where(kept_on, remembered, body_nats),

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ...tracing.tracer import Frame
 from .attention import AttentionState
 from .body import BodyState
+from .competition import CompetitionState
 from .detection import RecentReads
 from .dwell import DwellState
 from .free_path import FreePathState
@@ -29,6 +30,7 @@ class TagState(eqx.Module):
     dwell: DwellState | UnknownDepthState | None
     attention: AttentionState | None
     body: BodyState | None
+    competition: CompetitionState | None
     hidden: HiddenState | None
     free: FreePathState | None
     recent: RecentReads
@@ -51,6 +53,7 @@ def last_s(state: TagState, frame: Frame) -> Float[Array, ""]:
 def of_tags(state: TagState) -> list[Any]:
     """The arrays with one row a tag."""
     found = [*jax.tree.leaves(state.recent), *jax.tree.leaves(state.hidden), *jax.tree.leaves(state.free)]
+    found += jax.tree.leaves(state.competition)
     if state.dwell is not None:
         found += state.dwell.of_tags()
     if state.attention is not None:

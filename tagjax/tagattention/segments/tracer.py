@@ -6,11 +6,12 @@ A frame passes through them in this order:
 2. `travel`: what moves together -> motion that is pooled, and pasts that outlive a segment (shared as well);
 3. `dwell`, with the `reader`'s noise model: this frame's reads -> evidence for each tag at each segment; where nothing
    measures depth, `unknown_depth` finds it;
-4. `body`: evidence and motion in space -> which segments belong to the rigid body that carries the tag;
-5. `whole`: what is connected with a body that walks, and gets on as it does -> the whole of it;
-6. `hidden`: the last body -> its evidence where it comes out again, and whether the tag is out of view;
-7. `free`: the reads -> evidence for a path that nothing in view follows;
-8. `detection`: evidence for that body, against its rivals, and how recent it is -> the confidence that the tag is on it.
+4. `competition`: the other tags' bodies and evidence -> where this tag hardly is;
+5. `body`: evidence and motion in space -> which segments belong to the rigid body that carries the tag;
+6. `whole`: what is connected with a body that walks, and gets on as it does -> the whole of it;
+7. `hidden`: the last body -> its evidence where it comes out again, and whether the tag is out of view;
+8. `free`: the reads -> evidence for a path that nothing in view follows;
+9. `detection`: evidence for that body, against its rivals, and how recent it is -> the confidence that the tag is on it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from ...tracing.tracer import AbstractSmoother, Camera, Frame, Trace
 from .association import Association, SegmentTrace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody, LaterBody
+from .competition import Competition, CompetitionState, evidence_of
 from .cut import cut_segments
 from .detection import Detection, Explanations, RecentReads, best_of_segments
 from .dwell import DwellEvidence, DwellState
@@ -62,8 +64,8 @@ class TagAttention(AbstractSmoother):
     """Traces every tag by the segments that move as its phases say. `TagAttention()` has good values.
 
     None is a stage that is off. Without `body` the segments that explain the reads best are the object (`cut_segments`).
-    Raises `ValueError` without any evidence, for `hidden` and `free`, which need dwells, without them, and for `whole` without
-    a body to complete.
+    Raises `ValueError` without any evidence, for `hidden` and `free`, which need dwells, without them, and for `whole` and
+    `competition` without a body.
     """
 
     segments: SegmentTracker = eqx.field(default_factory=SegmentTracker)
@@ -73,6 +75,7 @@ class TagAttention(AbstractSmoother):
     unknown_depth: UnknownDepth | None = None
     attention: AttentionEvidence | None = None
     body: CarryingBody | None = eqx.field(default_factory=CarryingBody)
+    competition: Competition | None = eqx.field(default_factory=Competition)
     whole: WholeBody | None = eqx.field(default_factory=WholeBody)
     hidden: HiddenBody | None = eqx.field(default_factory=HiddenBody)
     free: FreePath | None = eqx.field(default_factory=FreePath)
@@ -89,6 +92,10 @@ class TagAttention(AbstractSmoother):
             raise ValueError("unknown_depth is on and dwell is off; expected dwell, whose memory it has.")
         if self.whole is not None and self.body is None:
             raise ValueError("whole is on and body is off; expected a body that it completes. Set whole to null.")
+        if self.competition is not None and self.body is None:
+            raise ValueError(
+                "competition is on and body is off; expected bodies that compete. Set competition to null."
+            )
 
     def init(self, camera: Camera, frame: Frame) -> TagAttentionState:
         """The state before the first frame."""
@@ -117,6 +124,7 @@ class TagAttention(AbstractSmoother):
             dwell=dwell,
             attention=attention,
             body=None if self.body is None else self.body.init(num_tags, num_segments),
+            competition=None if self.competition is None else CompetitionState.nothing(num_tags, num_segments),
             hidden=None if self.hidden is None else HiddenState.nothing(num_tags),
             free=None if self.free is None else self.free.init(num_tags, num_antennas),
             recent=RecentReads.nothing(num_tags),
@@ -213,8 +221,9 @@ class TagAttention(AbstractSmoother):
         if later is not None:
             later_evidence, later_body = later.on(found.labels)
             evidence = own + later_evidence
-        body, membership, place = self._bodies(state.body, evidence, found, since_s, now_s, later_body)
-        membership = jnp.where(frame.present[:, None], membership, 0.0)
+        prior_nats, rival_nats = self._competition(state.competition, evidence, own, found, frame.present)
+        body, membership, place = self._bodies(state.body, evidence, prior_nats, found, since_s, now_s, later_body)
+        membership = jnp.where(frame.present[:, None], membership, 0.0).astype(found.area.dtype)
         weight = membership * found.area[None]
         total = jnp.sum(weight, axis=1)
 
@@ -231,7 +240,9 @@ class TagAttention(AbstractSmoother):
             velocity_m_s = mean(found.motion_m) / jnp.maximum(dt_s, 1e-3)
             kept = jnp.exp(-dt_s / self.dwell.memory_s.value)
             unseen = self.hidden.out_of_view(camera, hidden, frame.depth_m, found.labels, membership, dt_s)
-            hidden, remembered = self.hidden.step(hidden, own_nats, some, centre_m, velocity_m_s, kept, dt_s)
+            hidden, remembered = self.hidden.step(
+                hidden, own_nats, some, centre_m, velocity_m_s, kept, dt_s, rival_nats
+            )
             hides = remembered & unseen
         free, free_nats, free_added = self._free(state, frame, since_s)
         recent = self.detection.received(state.recent, frame.arrivals, free_added, since_s, now_s)
@@ -251,7 +262,10 @@ class TagAttention(AbstractSmoother):
                 free=nats.free,
             )
         status = self.detection.status(reasons, around, detected, in_view, hides)
-        return TagState(now_s, travel, dwell, attention, body, hidden, free, recent), Association(
+        competition = (
+            None if state.competition is None else CompetitionState(membership, jax.lax.stop_gradient(confidence))
+        )
+        return TagState(now_s, travel, dwell, attention, body, competition, hidden, free, recent), Association(
             membership=membership,
             centre_m=centre_m,
             step_m=mean(found.increment_m.T),
@@ -334,10 +348,31 @@ class TagAttention(AbstractSmoother):
             now_s,
         )
 
+    def _competition(
+        self,
+        state: CompetitionState | None,
+        log_likelihood: Float[Array, "tag segment"],
+        own: Float[Array, "tag segment"],
+        found: SegmentFrame,
+        present: Bool[Array, " tag"],
+    ) -> tuple[Float[Array, "tag segment"] | None, Float[Array, " tag"] | None]:
+        """What the other tags leave each tag, nats, and the best `own` evidence for a body of any tag; None without the stage."""
+        if self.competition is None or state is None or self.body is None:
+            return None, None
+        evidence, temperature_nats = (
+            log_likelihood - log_likelihood[:, STATIC : STATIC + 1],
+            self.body.temperature_nats.value,
+        )
+        last = self.competition.bodies(state, found, present)
+        prior = self.competition.log_prior(last, evidence, found, temperature_nats)
+        rival_nats = jax.lax.stop_gradient(jnp.max(evidence_of(last.membership, own, found), axis=1))
+        return temperature_nats * prior, rival_nats
+
     def _bodies(
         self,
         state: BodyState | None,
         log_likelihood: Float[Array, "tag segment"],
+        prior_nats: Float[Array, "tag segment"] | None,
         found: SegmentFrame,
         since_s: Float[Array, ""],
         now_s: Float[Array, ""],
@@ -348,6 +383,8 @@ class TagAttention(AbstractSmoother):
             membership = cut_segments(log_likelihood, found.in_view)
             return None, membership, membership * found.area[None]
         evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
+        if prior_nats is not None:
+            evidence = evidence + prior_nats
         state, bodies = self.body.step(state, evidence, found, since_s, now_s, later)
         membership = jax.nn.sigmoid(bodies.log_odds)
         if self.whole is not None:

@@ -4,7 +4,8 @@ The parts of a walking person move against each other, so that no rigid motion h
 on, while the arm of someone who stays in place goes to and fro: over two thirds of a second its net displacement is small.
 So where most of a tag's body travels, the segments that travel too, and are connected with it by segments that travel,
 belong to it. Segments on legs hardly live for so long: those that are younger than that belong as well. What is not in
-front of the surface that has been seen at rest there is a shadow on it, and no part of a body.
+front of the surface that has been seen at rest there is a shadow on it, and no part of a body. Dark clothes have no depth and
+leave a gap. What stands upright has its parts above each other, so a gap may be higher than it may be wide.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from .connection import connected, touching
 from .step import SegmentFrame
 
 _FEW = 256  # segments that may belong to bodies that travel; in a crowd there are more
+_UPRIGHT = 0.65  # heights count so much where segments are connected: a gap may be 1.5 times as high as wide
 _MOST = 0.95  # probability that a connected segment belongs to the body
 
 
@@ -67,7 +69,7 @@ class WholeBody(eqx.Module):
         in_front = exists & (found.front > 0.5)
         joins = jnp.where(in_front, jnp.where(found.life_s < self.lag_s, 1.0, travels), 0.0)
         _, at = jax.lax.top_k(jax.lax.stop_gradient(joins), min(self.num_active, num_segments))
-        body = self._connected(found.centre_m[at], found.size_m[at], joins[at] > 0.5)
+        body = self._connected(flattened(found.centre_m)[at], found.size_m[at], joins[at] > 0.5)
 
         least = jax.nn.sigmoid(-self.share.value / 0.1)  # a body of which nothing travels takes nothing along
 
@@ -96,3 +98,8 @@ class WholeBody(eqx.Module):
         return jax.lax.cond(
             jnp.sum(member) <= few, of_few, lambda _: connected(touching(centre_m, size_m), member), operand=None
         )
+
+
+def flattened(centre_m: Float[Array, "segment 3"]) -> Float[Array, "segment 3"]:
+    """The places with lower heights (y, down): their distances decide what is connected."""
+    return centre_m * jnp.array([[1.0, _UPRIGHT, 1.0]], centre_m.dtype)
