@@ -58,7 +58,7 @@ LEARNED = {
     },
     "travel": {"reach_m", "noise_m", "noise_fraction", "travel_per_m", "heal_s"},
     "dwell": {"memory_s"},
-    "competition": ("together",),
+    "competition": {"together"},
     "whole": {"travel_m_s", "share"},
     "body.rigid": {"noise_m", "noise_fraction", "travel_per_m", "other_fraction", "most", "least", "shrink_m2"},
     "body": {
