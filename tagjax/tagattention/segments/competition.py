@@ -12,8 +12,9 @@ probability e, the other tags leave tag k the prior
 
     log o_ki = sum_{j != k} log(1 - (1 - e) sum_b p_jb m_bi)
 
-at segment i. For two tags whose confidence is 1 that is the exact marginal of both, since p is of each tag's own reads alone. So a tag that is as
-probable on another's body as on its own goes to its own, and two tags that took each other's bodies change places.
+at segment i. For two tags whose confidence is 1 that is the exact marginal of both, since p is of each tag's own reads alone.
+So a tag that is as probable on another's body as on its own goes to its own, and two tags that took each other's bodies
+change places.
 """
 
 from __future__ import annotations
@@ -85,8 +86,8 @@ class Competition(eqx.Module):
         mass = jnp.sum(weight, axis=1)
         shared = safe_divide(weight @ bodies.T, jnp.broadcast_to(mass[:, None], (len(mass), len(mass))))
         # A body that several tags had at the last frame is one body.
-        times = jnp.log(jnp.maximum(jnp.sum(shared, axis=1), 1.0))
-        of_body = evidence_of(bodies, evidence, found) / temperature_nats - times[None]
+        log_tags = jnp.log(jnp.maximum(jnp.sum(shared, axis=1), 1.0))
+        of_body = evidence_of(bodies, evidence, found) / temperature_nats - log_tags[None]
         logits = jnp.concatenate([of_body, (elsewhere / temperature_nats)[:, None]], axis=1)
         on_body = last.confidence[:, None] * jax.nn.softmax(logits, axis=1)[:, :-1]
         taken = on_body @ bodies

@@ -359,10 +359,8 @@ class TagAttention(AbstractSmoother):
         """What the other tags leave each tag, nats, and the best `own` evidence for a body of any tag; None without the stage."""
         if self.competition is None or state is None or self.body is None:
             return None, None
-        evidence, temperature_nats = (
-            log_likelihood - log_likelihood[:, STATIC : STATIC + 1],
-            self.body.temperature_nats.value,
-        )
+        evidence = log_likelihood - log_likelihood[:, STATIC : STATIC + 1]
+        temperature_nats = self.body.temperature_nats.value
         last = self.competition.bodies(state, found, present)
         prior = self.competition.log_prior(last, evidence, found, temperature_nats)
         rival_nats = jax.lax.stop_gradient(jnp.max(evidence_of(last.membership, own, found), axis=1))
