@@ -13,7 +13,7 @@ from ...report.paper.curves import NUM_FRAMES, Panel, score_figure
 from ...sim.suites import Item
 from ...tagattention.tracer_settings import with_values
 from .settings import LEARNABLE, PUBLISHED
-from .sources import Sources, System
+from .sources import Sources, System, items_by_variant
 
 NAMES = {LEARNABLE: "TagAttention, learnable (this project)", PUBLISHED: "TagAttention as published"}
 """The tracers as legends name them."""
@@ -29,8 +29,8 @@ Lines = dict[str, dict[str, Curve]]
 def all_and_each(sources: Sources, items: list[Item], path: Path) -> str:
     """Fig. 10: the mean of all recordings by both tracers, and the learnable tracer's by object."""
     lines = _both(sources, items)
-    by_variant = _by_variant(items)
-    each = {name: _curves(sources, sources.system(LEARNABLE), own) for name, own in by_variant.items()}
+    learnable = sources.system(LEARNABLE)
+    each = {name: _curves(sources, learnable, own) for (_, name), own in items_by_variant(items).items()}
     panels = [Panel("mean of all", lines), Panel("learnable, by object", each, bands=False)]
     return _draw(path, panels, stated=panels[:1])
 
@@ -52,7 +52,9 @@ def by_suite(sources: Sources, items: list[Item], path: Path) -> str:
 
 def by_variant(sources: Sources, items: list[Item], path: Path) -> str:
     """Figs. 16 and 19: a column of panels for each variant of a suite, both tracers in each."""
-    panels = [Panel(name.replace("m_s", " m/s"), _both(sources, own)) for name, own in _by_variant(items).items()]
+    panels = [
+        Panel(name.replace("m_s", " m/s"), _both(sources, own)) for (_, name), own in items_by_variant(items).items()
+    ]
     return _draw(path, panels)
 
 
@@ -60,18 +62,13 @@ def by_threshold(sources: Sources, items: list[Item], path: Path) -> str:
     """Fig. 17: the published tracer at three velocity thresholds, and the learnable one, which has none."""
     settings = sources.config.tracers[PUBLISHED]
     panels = []
-    for name, own in _by_variant(items).items():
+    for (_, name), own in items_by_variant(items).items():
         lines: Lines = {"learnable (no threshold)": _curves(sources, sources.system(LEARNABLE), own)}
         for v0 in V0_M_S:
             system = System(f"published, v0 {v0:g} m/s", with_values(settings, {"v0_m_s": v0}))
             lines[f"as published with $v_0$ = {v0:g} m/s"] = _curves(sources, system, own)
         panels.append(Panel(f"{name} target", lines))
     return _draw(path, panels, scores=("iou",))
-
-
-def _by_variant(items: Sequence[Item]) -> dict[str, list[Item]]:
-    names = dict.fromkeys(item.variant.name for item in items)
-    return {name: [item for item in items if item.variant.name == name] for name in names}
 
 
 def _both(sources: Sources, items: Sequence[Item]) -> Lines:

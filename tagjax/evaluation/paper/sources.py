@@ -27,6 +27,14 @@ from .traced import Traced, read_traced, write_traced
 T = TypeVar("T")
 
 
+def items_by_variant(items: Sequence[Item]) -> dict[tuple[str, str], list[Item]]:
+    """The recordings by the names of suite and variant, in the order of the first of each."""
+    groups: dict[tuple[str, str], list[Item]] = {}
+    for item in items:
+        groups.setdefault((item.suite.name, item.variant.name), []).append(item)
+    return groups
+
+
 class MissingRecordingsError(ConfigError):
     """A figure has no recording, and missing ones are not simulated."""
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.results import write_csv
 from ...metrics.boxes import box_iou
+from ...metrics.mean import MaskedMean
 from ...metrics.recordings import Picture
 from ...metrics.tags import FrameScores
 from ...recording import Recording
@@ -17,7 +18,7 @@ from ...report.paper.strips import Cell, Row, strip_figure
 from ...report.paper.style import around
 from ...sim.suites import Item
 from .settings import LEARNABLE, PUBLISHED
-from .sources import Sources, System
+from .sources import Sources, System, items_by_variant
 from .traced import Traced
 
 _SINCE = (10, 25, 40, 60, 85)
@@ -57,8 +58,8 @@ def several(sources: Sources, items: list[Item], path: Path) -> str:
     """Fig. 15: both tracers with two objects and with four, two of them alike: the first recording of each, numbers of all."""
     rows: list[Row] = []
     lines: list[Line] = []
-    told: list[str] = []
-    for item, *more in _by_variant(items):
+    stated: list[str] = []
+    for item, *more in items_by_variant(items).values():
         recording = sources.recording(item)
         for name in (LEARNABLE, PUBLISHED):
             traced = sources.traced(sources.system(name), item)
@@ -66,18 +67,18 @@ def several(sources: Sources, items: list[Item], path: Path) -> str:
             label = f"{len(traced.frames)} objects\n{_SHORT[name]}"
             rows.append(_row(label, recording, traced, frames, lines, item, name))
             own = [_identified(one.frames) for one in (traced, *_without_pictures(sources, name, more))]
-            told.append(f"{len(traced.frames)} objects, {_SHORT[name]} {_mean(np.concatenate(own)):.2f}")
+            stated.append(f"{len(traced.frames)} objects, {_SHORT[name]} {_mean(np.concatenate(own)):.2f}")
     count = max(len(row.cells[0].masks) for row in rows)
     strip_figure(path, rows, names=[f"tag {number}" for number in range(1, count + 1)])
     _write(path, lines)
-    return f"Fraction of frames since the first motion in which a tag's own object is identified: {'; '.join(told)}."
+    return f"Fraction of frames since the first motion in which a tag's own object is identified: {'; '.join(stated)}."
 
 
 def blocked(sources: Sources, items: list[Item], path: Path) -> str:
     """Fig. 20: both tracers before, while and after something covers the object: the first recording, numbers of all."""
     rows: list[Row] = []
     lines: list[Line] = []
-    told: list[str] = []
+    stated: list[str] = []
     for name in (LEARNABLE, PUBLISHED):
         waits_s = []
         for item in items:
@@ -89,12 +90,12 @@ def blocked(sources: Sources, items: list[Item], path: Path) -> str:
                 rows.append(_row(_SHORT[name], recording, traced, frames, lines, item, name, titles))
             waits_s.append(_recovery_s(scores, frames[-3], recording))
         soon = int(np.sum(np.array(waits_s) <= 1.0))
-        told.append(f"{_SHORT[name]} {soon} of {len(items)} ({_wait_text(waits_s[0])} in the one shown)")
+        stated.append(f"{_SHORT[name]} {soon} of {len(items)} ({_wait_text(waits_s[0])} in the one shown)")
     strip_figure(path, rows)
     _write(path, lines)
     return (
         f"Shown: {items[0].name}. Recordings in which the box IoU reaches 0.5 again within a second after the object is back in "
-        f"view: {'; '.join(told)}."
+        f"view: {'; '.join(stated)}."
     )
 
 
@@ -104,7 +105,7 @@ def alike(sources: Sources, items: list[Item], path: Path) -> str:
     The first recording of each, numbers of all.
     """
     learnable = sources.config.tracers[LEARNABLE]
-    one, two = _by_variant(items)
+    one, two = items_by_variant(items).values()
     runs = (
         ("published,\none antenna", sources.system(PUBLISHED), one),
         ("learnable,\none antenna", sources.system(LEARNABLE), one),
@@ -112,7 +113,7 @@ def alike(sources: Sources, items: list[Item], path: Path) -> str:
     )
     rows: list[Row] = []
     lines: list[Line] = []
-    told: list[str] = []
+    stated: list[str] = []
     for label, system, own in runs:
         means = []
         for item in own:
@@ -123,27 +124,18 @@ def alike(sources: Sources, items: list[Item], path: Path) -> str:
                 rows.append(_row(label, recording, traced, frames, lines, item, system.name))
         alone, both, same = (_mean(np.array(one)) for one in zip(*means, strict=True))
         plain = label.replace("\n", " ")
-        told.append(
+        stated.append(
             f"{plain}: box IoU {alone:.2f} with the tag's own object, {both:.2f} with both as one, {same:.2f} of the frames with "
             "one mask for both tags"
         )
     strip_figure(path, rows, names=("tag 1", "tag 2"))
     _write(path, lines)
-    return f"From frame 40 after the first motion: {'; '.join(told)}. Neither tracer compares RSSI with positions."
-
-
-def _by_variant(items: Sequence[Item]) -> list[list[Item]]:
-    """The recordings of each suite's variant, in the order of their first ones."""
-    groups: dict[tuple[str, str], list[Item]] = {}
-    for item in items:
-        groups.setdefault((item.suite.name, item.variant.name), []).append(item)
-    return list(groups.values())
+    return f"From frame 40 after the first motion: {'; '.join(stated)}. Neither tracer compares RSSI with positions."
 
 
 def _mean(values: np.ndarray) -> float:
     """Of those that are numbers; NaN where none is."""
-    known = values[np.isfinite(values)]
-    return float(np.mean(known)) if known.size else float("nan")
+    return MaskedMean.of(values, np.ones(values.shape, bool)).result()
 
 
 def _without_pictures(sources: Sources, name: str, items: Sequence[Item]) -> list[Traced]:
