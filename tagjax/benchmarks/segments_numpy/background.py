@@ -72,16 +72,20 @@ class Background:
         nearer = (confirmed > 0) & (candidate < confirmed - tolerance)
         wait_s = np.where(nearer, np.float32(original._NEARER_FACTOR) * self.confirm_s, self.confirm_s)
         np.copyto(confirmed, candidate, where=seen & (age >= wait_s))
-        behind = (confirmed > 0) & (depth_m > confirmed + tolerance) & (depth_m < 2 * confirmed + 1)
+        behind = _behind(depth_m, confirmed, tolerance)
         np.add(self.deeper_s, dt_s, out=self.deeper_s, where=valid & behind)
         np.copyto(self.deeper_s, np.float32(0), where=valid & ~behind)
         revealed = self.deeper_s > max(self.reveal_s, np.float32(original._REVEAL_FRAMES) * dt_s)
         np.copyto(confirmed, np.float32(0), where=revealed)
         shown = valid & (confirmed > 0) & (np.abs(depth_m - confirmed) < tolerance)
         rested = self.rested_m
-        gone = valid & (rested > 0) & (depth_m > rested + tolerance) & (depth_m < 2 * rested + 1)
-        np.copyto(rested, np.float32(0), where=gone)
+        np.copyto(rested, np.float32(0), where=valid & _behind(depth_m, rested, tolerance))
         np.maximum(rested, candidate, out=rested, where=seen & (age > self.early_s))
         front = valid & ((rested <= 0) | (depth_m < rested - 2 * tolerance))
         self.started |= bool(valid.any())
         return View(confirmed=shown, matched=matched, age_s=age, still=still, front=front)
+
+
+def _behind(depth_m: np.ndarray, surface_m: np.ndarray, tolerance_m: np.ndarray) -> np.ndarray:
+    """Whether the depth is behind a surface that is known."""
+    return (surface_m > 0) & (depth_m > surface_m + tolerance_m) & (depth_m < 2 * surface_m + 1)

@@ -111,14 +111,14 @@ class Background(eqx.Module):
         nearer = (state.confirmed_m > 0) & (candidate < state.confirmed_m - tolerance)
         ripe = seen & (age >= jnp.where(nearer, _NEARER_FACTOR * self.confirm_s, self.confirm_s))
         confirmed = jnp.where(ripe, candidate, state.confirmed_m)
-        deeper = valid & (confirmed > 0) & _behind(depth_m, confirmed, tolerance)
+        deeper = valid & _behind(depth_m, confirmed, tolerance)
         deeper_s = jnp.where(deeper, state.deeper_s + dt_s, jnp.where(valid, 0.0, state.deeper_s))
         revealed = deeper_s > jnp.maximum(self.reveal_s, _REVEAL_FRAMES * dt_s)
         confirmed = jnp.where(revealed, 0.0, confirmed)
 
         # A surface behind what was seen at rest shows that this was an object, which has gone: a person who walks away.
         last = state.rested_m
-        gone = valid & (last > 0) & _behind(depth_m, last, tolerance)
+        gone = valid & _behind(depth_m, last, tolerance)
         last = jnp.where(gone, 0.0, last)
         rested = jnp.where(seen & (age > self.early_s), jnp.maximum(last, candidate), last)
         # Both depths have their error.
@@ -144,5 +144,5 @@ def _behind(
     surface_m: Float[Array, "height width"],
     tolerance_m: Float[Array, "height width"],
 ) -> Bool[Array, "height width"]:
-    """Whether the depth is behind a surface; more than twice as deep is a wrong measurement more often than a view past it."""
-    return (depth_m > surface_m + tolerance_m) & (depth_m < 2.0 * surface_m + 1.0)
+    """Whether the depth is behind a surface that is known; more than twice as deep is a wrong measurement more often than a view past it."""
+    return (surface_m > 0) & (depth_m > surface_m + tolerance_m) & (depth_m < 2.0 * surface_m + 1.0)

@@ -47,6 +47,27 @@ class CompetitionState(eqx.Module):
         return CompetitionState(jnp.zeros((num_tags, num_segments)), jnp.zeros(num_tags))
 
 
+class LastBodies(eqx.Module):
+    """The bodies of the last frame on the segments of this one."""
+
+    membership: Float[Array, "body segment"]
+    weight: Float[Array, "body segment"]  # pixels
+    confidence: Float[Array, " body"]
+
+    def evidence_of(self, evidence: Float[Array, "tag segment"]) -> Float[Array, "tag body"]:
+        """The mean evidence of each tag over each body, nats; very low for a body of less than a pixel."""
+        mass = jnp.sum(self.weight, axis=1)
+        mean = safe_divide(evidence @ self.weight.T, jnp.broadcast_to(mass[None], (len(evidence), len(mass))))
+        return jnp.where((mass > _SOME)[None], mean, _NOWHERE)
+
+    def num_tags(self) -> Float[Array, " body"]:
+        """The number of tags that had each body, at least 1: by how much of it is theirs."""
+        mass = jnp.sum(self.weight, axis=1)
+        shared = self.weight @ self.membership.T
+        shared = safe_divide(shared, jnp.broadcast_to(mass[:, None], shared.shape))
+        return jnp.maximum(jnp.sum(shared, axis=1), 1.0)
+
+
 class Competition(eqx.Module):
     """Stage that makes bodies which explain other tags' reads improbable for a tag. `Competition()` has good values."""
 
@@ -56,50 +77,30 @@ class Competition(eqx.Module):
         """Raises `ValueError` for a probability that is not between 0 and 1."""
         self.together = Fraction(together)
 
-    def bodies(self, state: CompetitionState, found: SegmentFrame, present: Bool[Array, " tag"]) -> CompetitionState:
+    def bodies(self, state: CompetitionState, found: SegmentFrame, present: Bool[Array, " tag"]) -> LastBodies:
         """The bodies of the last frame on the segments of this one, none for a tag that is not `present`.
 
         A new segment belongs to the bodies to which the one belonged that it comes from.
         """
         source = row_sources(found.source)
         there = found.in_view & (source != STATIC)
-        return CompetitionState(
-            membership=jnp.where(there[None] & present[:, None], state.membership[:, source], 0.0),
-            confidence=jnp.where(present, state.confidence, 0.0),
-        )
+        membership = jnp.where(there[None] & present[:, None], state.membership[:, source], 0.0)
+        return LastBodies(membership, membership * found.area[None], jnp.where(present, state.confidence, 0.0))
 
     def log_prior(
         self,
-        last: CompetitionState,
+        last: LastBodies,
         evidence: Float[Array, "tag segment"],
         found: SegmentFrame,
         temperature_nats: Float[Array, ""],
     ) -> Float[Array, "tag segment"]:
-        """Log prior of each segment as the place of each tag, 0 at most; `evidence` is against a tag at rest, nats.
-
-        `last` are the bodies of the last frame on the segments of this one.
-        """
-        bodies = last.membership
-        free = found.in_view & (jnp.max(bodies, axis=0, initial=0.0) < _HELD)
+        """Log prior of each segment as the place of each tag, 0 at most; `evidence` is against a tag at rest, nats."""
+        free = found.in_view & (jnp.max(last.membership, axis=0, initial=0.0) < _HELD)
         elsewhere = jnp.max(jnp.where(free[None], evidence, 0.0), axis=1, initial=0.0)
-        weight = bodies * found.area[None]
-        mass = jnp.sum(weight, axis=1)
-        shared = safe_divide(weight @ bodies.T, jnp.broadcast_to(mass[:, None], (len(mass), len(mass))))
         # A body that several tags had at the last frame is one body.
-        log_tags = jnp.log(jnp.maximum(jnp.sum(shared, axis=1), 1.0))
-        of_body = evidence_of(bodies, evidence, found) / temperature_nats - log_tags[None]
+        of_body = last.evidence_of(evidence) / temperature_nats - jnp.log(last.num_tags())[None]
         logits = jnp.concatenate([of_body, (elsewhere / temperature_nats)[:, None]], axis=1)
         on_body = last.confidence[:, None] * jax.nn.softmax(logits, axis=1)[:, :-1]
-        taken = on_body @ bodies
+        taken = on_body @ last.membership
         left = jnp.log1p(-(1.0 - self.together.value) * jnp.clip(taken, 0.0, 1.0))
         return jnp.sum(left, axis=0, keepdims=True) - left
-
-
-def evidence_of(
-    bodies: Float[Array, "body segment"], evidence: Float[Array, "tag segment"], found: SegmentFrame
-) -> Float[Array, "tag body"]:
-    """The mean evidence of each tag over each body, nats; very low for a body of less than a pixel."""
-    weight = bodies * found.area[None]
-    mass = jnp.sum(weight, axis=1)
-    mean = safe_divide(evidence @ weight.T, jnp.broadcast_to(mass[None], (len(evidence), len(mass))))
-    return jnp.where((mass > _SOME)[None], mean, _NOWHERE)

@@ -33,7 +33,7 @@ from ...tracing.tracer import AbstractSmoother, Camera, Frame, Trace
 from .association import Association, SegmentTrace
 from .attention import AttentionEvidence, AttentionState
 from .body import BodyState, CarryingBody, LaterBody
-from .competition import Competition, CompetitionState, evidence_of
+from .competition import Competition, CompetitionState
 from .cut import cut_segments
 from .detection import Detection, Explanations, RecentReads, best_of_segments
 from .dwell import DwellEvidence, DwellState
@@ -363,7 +363,7 @@ class TagAttention(AbstractSmoother):
         temperature_nats = self.body.temperature_nats.value
         last = self.competition.bodies(state, found, present)
         prior = self.competition.log_prior(last, evidence, found, temperature_nats)
-        rival_nats = jax.lax.stop_gradient(jnp.max(evidence_of(last.membership, own, found), axis=1))
+        rival_nats = jax.lax.stop_gradient(jnp.max(last.evidence_of(own), axis=1))
         return temperature_nats * prior, rival_nats
 
     def _bodies(
