@@ -176,7 +176,7 @@ def test_files_hold_the_controls_and_are_the_same_each_time(piece: Piece, tmp_pa
     [
         (
             {"hindsight": {"learn": "body"}},
-            r"hindsight\.learn: found 'body'; expected one of 'all', 'masks', 'confidence'",
+            r"hindsight\.learn: found 'body'; expected one of 'all', 'masks', 'confidence', 'reads'",
         ),
         ({"hindsight": {"controls": 1.0}}, r"hindsight: controls is 1\.0; expected a fraction from 0 to 1, 1 excluded"),
         (

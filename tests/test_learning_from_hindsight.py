@@ -217,7 +217,7 @@ LEAST = {
         ({"hindsight": {"piece_frames": 0}}, "hindsight: piece_frames is 0; expected at least 1"),
         (
             {"joint": {"flow": {}, "optimizer": {}}},
-            "learning from hindsight does not reach the flow; expected experiment=clips",
+            r"hindsight\.learn=all does not reach the flow; expected hindsight\.learn=reads",
         ),
     ],
 )

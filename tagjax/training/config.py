@@ -45,9 +45,10 @@ class TrainConfig:
             raise ConfigError(
                 "found both hindsight and objective; expected one: objective=hindsight or, say, coherent."
             )
-        if self.joint is not None and isinstance(self.learned, HindsightSettings):
+        if self.joint is not None and isinstance(self.learned, HindsightSettings) and self.learned.learn != "reads":
             raise ConfigError(
-                "joint is on, and learning from hindsight does not reach the flow; expected experiment=clips with it."
+                f"joint is on, and hindsight.learn={self.learned.learn} does not reach the flow; expected "
+                "hindsight.learn=reads, or experiment=clips."
             )
         if (
             self.data.control is not None

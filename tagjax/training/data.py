@@ -22,7 +22,7 @@ from ..tagattention.tracer_settings import make_tracer
 from ..tracing.clips import clip_loader
 from .clip_dataset import clip_dataset
 from .config import TrainConfig
-from .hindsight import HindsightSettings, PieceFiles
+from .hindsight import HindsightSettings, PieceFiles, PieceWindows
 from .step import ClipLike
 
 VALIDATION_CLIPS = 2
@@ -34,7 +34,7 @@ class TrainingData:
 
     samples: Stream
     batch_size: int  # samples in a step
-    held_out: Sequence[ClipLike] | PieceFiles
+    held_out: Sequence[ClipLike] | PieceFiles | PieceWindows
     score: str  # the diagnostic of `held_out` that says how good unlabelled results are
     remove: Callable[[], None] = lambda: None  # deletes what is of no use after the run
 
@@ -114,9 +114,25 @@ def _pieces(
             f"{settings.teacher}), so there is nothing to learn. Give recordings in which tags move and are read."
         )
     console.print(f"{sure} masks to learn from, in {len(files)} pieces of recordings (teacher: {settings.teacher}).")
-    batch_size = config.loop.batch_size or len(files)
-    dataset = grain.MapDataset.source(files)
-    if batch_size < len(files):
+    remove, score = PieceFiles(folder / "pieces").remove, "nats" if settings.learn == "reads" else "overlap"
+    if config.joint is None:
+        batch_size = config.loop.batch_size or len(files)
+        return TrainingData(_stream(files, batch_size, config), batch_size, found["validation"], score, remove)
+    length, both = config.data.clips.length, ((files, training), (found["validation"], validation))
+    windows, held_out = (PieceWindows.of(*one, length=length, sure=settings.sure) for one in both)
+    if not windows:
+        raise RecordingError(
+            f"hindsight: found no {length} frames in a row with a mask of a confidence above {settings.sure} in half of them, so there is "
+            "nothing to learn from. Give longer recordings, or a smaller data.clips.length."
+        )
+    console.print(f"{len(windows)} windows of {length} frames for the flow network.")
+    batch_size = config.loop.batch_size or 1
+    return TrainingData(_stream(windows, batch_size, config), batch_size, held_out, score, remove)
+
+
+def _stream(samples: Sequence[ClipLike] | PieceFiles | PieceWindows, batch_size: int, config: TrainConfig) -> Stream:
+    """The samples again and again, shuffled where a step does not take all of them."""
+    dataset = grain.MapDataset.source(samples)
+    if batch_size < len(samples):
         dataset = dataset.shuffle(seed=config.seed)
-    samples = Stream(dataset.repeat())
-    return TrainingData(samples, batch_size, found["validation"], "overlap", PieceFiles(folder / "pieces").remove)
+    return Stream(dataset.repeat())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -20,6 +20,9 @@ from ..flow.stationary import is_moving
 from ..flow.weights import save_weights
 from ..tracing.tracer import AbstractTracer, Frame
 from .flow_step import terms_both_ways
+from .hindsight import FilmedFrames
+
+FramesT = TypeVar("FramesT", bound=Frame | FilmedFrames)
 
 
 class Flow(eqx.Module):
@@ -28,8 +31,10 @@ class Flow(eqx.Module):
     forward_px: Float[Array, "time height width 2"]
     backward_px: Float[Array, "time height width 2"]
 
-    def replace_in(self, frames: Frame) -> Frame:
+    def replace_in(self, frames: FramesT) -> FramesT:
         """The clip with this flow in place of its own."""
+        if isinstance(frames, FilmedFrames):
+            return eqx.tree_at(lambda f: f.backward_px, frames, self.backward_px)
         return eqx.tree_at(lambda f: (f.forward_px, f.backward_px), frames, (self.forward_px, self.backward_px))
 
 
@@ -41,18 +46,24 @@ class JointModel(eqx.Module):
     weight: float = eqx.field(static=True)
     loss: FlowLossSettings = eqx.field(static=True)
 
+    @property
+    def own_loss(self) -> FlowLossSettings | None:
+        """The settings of the network's own loss; None where it has no weight, and is not computed."""
+        return self.loss if self.weight > 0 else None
+
 
 PAIRS_AT_ONCE = 4
 """Pairs of pictures whose flow is computed together; the last group may be smaller, and is then compiled separately."""
 
 
 def network_flow(
-    network: AbstractFlowNetwork, frames: Frame, settings: FlowLossSettings
+    network: AbstractFlowNetwork, frames: Frame | FilmedFrames, settings: FlowLossSettings | None
 ) -> tuple[Flow, Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The flow of a clip's pictures at its working resolution, and the network's loss on them with its terms.
 
     As in the cache, flow that explains the pictures no better than zero flow is set to zero (`is_moving`). The loss is
-    computed before that, on the whole pictures, padded by their edges to the sizes that the network needs.
+    computed before that, on the whole pictures, padded by their edges to the sizes that the network needs; without
+    `settings` it is 0 and has no terms. Frames of pieces have no forward flow then: it is 0.
     """
     if frames.colour is None:
         raise ValueError("found a clip without pictures; load it with colour=True to compute flow from them.")
@@ -65,16 +76,21 @@ def network_flow(
         pictures = jnp.stack(
             [jnp.pad(each, (*sides, (0, 0)), mode="edge").astype(dtype) / 255 for each in (one, other)]
         )
-        forward, backward = flow_both_ways(network, pictures[0], pictures[1])
-        terms = terms_both_ways(forward, backward, pictures, pictures.shape[1:3], jnp.ones((), dtype), settings)
         place = tuple(slice(before, before + size) for (before, _), size in zip(sides, (height, width), strict=True))
 
         def working(flow: Array, here: Array, there: Array) -> Array:
             moved = is_moving(flow, here, there)[..., None]
             return jnp.where(moved, flow, 0.0)[place][::stride, ::stride] / stride
 
-        ways = working(forward[-1], *pictures), working(backward[-1], *pictures[::-1])
-        return ways, terms
+        if settings is None and isinstance(frames, FilmedFrames):
+            here, there = network.encode(pictures[0]), network.encode(pictures[1])
+            backward = working(network.decode(there, here)[-1], *pictures[::-1])
+            return (jnp.zeros_like(backward), backward), {}
+        forward, backward = flow_both_ways(network, pictures[0], pictures[1])
+        terms = {}
+        if settings is not None:
+            terms = terms_both_ways(forward, backward, pictures, pictures.shape[1:3], jnp.ones((), dtype), settings)
+        return (working(forward[-1], *pictures), working(backward[-1], *pictures[::-1])), terms
 
     # One group after the other, to bound the memory of activations; but not by `lax.map`: in a loop XLA's CPU backend takes
     # twelve times as long over convolutions.
@@ -85,10 +101,11 @@ def network_flow(
     first = jnp.zeros_like(forward[:1])
     terms = jax.tree.map(jnp.mean, terms)
     flow = Flow(*(jnp.concatenate([first, way]) for way in (forward, backward)))
-    return flow, total_loss(terms, settings), {f"flow/{name}": value for name, value in terms.items()}
+    loss = jnp.zeros(()) if settings is None else total_loss(terms, settings)
+    return flow, loss, {f"flow/{name}": value for name, value in terms.items()}
 
 
-def _stride(frames: Frame) -> int:
+def _stride(frames: Frame | FilmedFrames) -> int:
     """The stride in pixels from the pictures to the working resolution."""
     assert frames.colour is not None
     (height, width), (rows, columns) = frames.colour.shape[1:3], frames.depth_m.shape[1:3]

@@ -22,11 +22,14 @@ from jaxtyping import Array, Float, PyTree, UInt32
 from ..core.compilation import large_program
 from ..tracing.tracer import AbstractTracer, Camera, Frame
 from .devices import AXIS, local_mesh, replicate_locally, shard_locally
-from .hindsight import HindsightSettings, PieceFrames
+from .hindsight import FilmedFrames, HindsightSettings, PieceFrames
 from .joint import Flow, JointModel, network_flow
 from .objective import ObjectiveSettings, objective
 from .processes import mean_over_processes
 from .state import TrainState
+
+Frames = Frame | PieceFrames | FilmedFrames
+"""What a sample consists of."""
 
 
 @runtime_checkable
@@ -37,7 +40,7 @@ class ClipLike(Protocol):
     def camera(self) -> Camera: ...
 
     @property
-    def frames(self) -> Frame | PieceFrames: ...
+    def frames(self) -> Frames: ...
 
 
 Objective = ObjectiveSettings | HindsightSettings
@@ -45,11 +48,11 @@ Objective = ObjectiveSettings | HindsightSettings
 
 
 def objective_terms(
-    tracer: AbstractTracer, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
+    tracer: AbstractTracer, camera: Camera, frames: Frames, key: Array, settings: Objective
 ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
     """Every term that has a weight, unweighted, and diagnostics, of one clip or piece."""
     if isinstance(settings, HindsightSettings):
-        assert isinstance(frames, PieceFrames)
+        assert not isinstance(frames, Frame)
         return settings.terms(tracer, camera, frames)
     assert isinstance(frames, Frame)
     return objective(tracer, camera, frames, key, settings)
@@ -81,7 +84,7 @@ def make_joint_optimizer(
 
 @large_program()
 def clip_gradient(
-    model: Model, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
+    model: Model, camera: Camera, frames: Frames, key: Array, settings: Objective
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
     """Gradient of the weighted objective of one clip, each term's value, and with `term_norms` its gradient's norm.
 
@@ -91,18 +94,18 @@ def clip_gradient(
 
 
 def _clip_gradient(
-    model: Model, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
+    model: Model, camera: Camera, frames: Frames, key: Array, settings: Objective
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
     if not isinstance(model, JointModel):
         (gradient, _), logged = _term_gradients(model, None, camera, frames, key, settings)
         if isinstance(settings, HindsightSettings):
             gradient = settings.bounded(gradient)
         return gradient, logged
-    assert isinstance(frames, Frame)
+    assert not isinstance(frames, PieceFrames)
     learnable, static = eqx.partition(model.network, eqx.is_inexact_array)
 
     def compute_flow(learnable: PyTree) -> tuple[tuple[Flow, Array], dict[str, Array]]:
-        flow, loss, terms = network_flow(eqx.combine(learnable, static), frames, model.loss)
+        flow, loss, terms = network_flow(eqx.combine(learnable, static), frames, model.own_loss)
         return (flow, loss), terms
 
     (flow, loss), pull, terms = jax.vjp(compute_flow, learnable, has_aux=True)
@@ -118,7 +121,7 @@ def _term_gradients(
     tracer: AbstractTracer,
     flow: Flow | None,
     camera: Camera,
-    frames: Frame | PieceFrames,
+    frames: Frames,
     key: Array,
     settings: Objective,
 ) -> tuple[tuple[PyTree, Flow | None], dict[str, Float[Array, ""]]]:
@@ -131,7 +134,7 @@ def _term_gradients(
 
     def terms(inputs: tuple[PyTree, Flow | None]) -> tuple[dict[str, Array], dict[str, Array]]:
         learnable, flow = inputs
-        given = flow.replace_in(frames) if flow is not None and isinstance(frames, Frame) else frames
+        given = frames if flow is None or isinstance(frames, PieceFrames) else flow.replace_in(frames)
         return objective_terms(eqx.combine(learnable, static), camera, given, key, settings)
 
     values, pull, diagnostics = jax.vjp(terms, (learnable, flow), has_aux=True)
@@ -159,12 +162,12 @@ def _term_gradients(
 
 @large_program()
 def _gradients_side_by_side(
-    model: Model, camera: Camera, frames: Frame | PieceFrames, keys: UInt32[Array, "clip 2"], settings: Objective
+    model: Model, camera: Camera, frames: Frames, keys: UInt32[Array, "clip 2"], settings: Objective
 ) -> tuple[PyTree, dict[str, Float[Array, " clip"]]]:
     """`clip_gradient` of stacked clips, one on each device of this process."""
     arrays, static = eqx.partition(model, eqx.is_array)
 
-    def on_one(arrays: PyTree, camera: Camera, frames: Frame | PieceFrames, key: Array) -> Any:
+    def on_one(arrays: PyTree, camera: Camera, frames: Frames, key: Array) -> Any:
         # Each device holds one clip: mapped, not vectorised, so that it runs the program of a single clip.
         camera, frames, key = jax.tree.map(lambda leaf: leaf[0], (camera, frames, key))
         result = _clip_gradient(eqx.combine(arrays, static), camera, frames, key, settings)
@@ -213,13 +216,13 @@ def _gradients(
 
 @large_program()
 def clip_loss(
-    model: Model, camera: Camera, frames: Frame | PieceFrames, key: Array, settings: Objective
+    model: Model, camera: Camera, frames: Frames, key: Array, settings: Objective
 ) -> dict[str, Float[Array, ""]]:
     """Terms, diagnostics and the weighted sum of one clip, without gradients."""
     terms: dict[str, Array] = {"loss": jnp.zeros(())}
     if isinstance(model, JointModel):
-        assert isinstance(frames, Frame)
-        flow, own_loss, flow_terms = network_flow(model.network, frames, model.loss)
+        assert not isinstance(frames, PieceFrames)
+        flow, own_loss, flow_terms = network_flow(model.network, frames, model.own_loss)
         model, frames, terms = (
             model.tracer,
             flow.replace_in(frames),

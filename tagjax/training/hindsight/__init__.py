@@ -6,7 +6,18 @@ a step then traces whole recordings, without a pixel, in a second each (`objecti
 """
 
 from .files import PieceFiles
+from .likelihood import FilmedFrames
 from .objective import HindsightSettings
 from .pieces import Piece, PieceFrames, segment_pieces
+from .windows import PieceWindows, Window
 
-__all__ = ["HindsightSettings", "Piece", "PieceFiles", "PieceFrames", "segment_pieces"]
+__all__ = [
+    "FilmedFrames",
+    "HindsightSettings",
+    "Piece",
+    "PieceFiles",
+    "PieceFrames",
+    "PieceWindows",
+    "Window",
+    "segment_pieces",
+]

@@ -73,6 +73,10 @@ class PieceFiles:
             on_progress(stage, len(index) + 1, len(recordings))
         return self
 
+    def recording_of(self, index: int) -> int:
+        """The number of the recording that a piece is of."""
+        return [number for number, names in enumerate(self._index()) for _ in names][index]
+
     def num_sure(self, settings: HindsightSettings) -> int:
         """The number of tag-frames in which the teacher is sure of a mask."""
         return sum(int(np.sum(one.frames.present & (one.frames.confidence > settings.sure))) for one in self)

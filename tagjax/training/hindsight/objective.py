@@ -18,6 +18,7 @@ from ...tagattention.segments import Detection, TagAttention
 from ...tagattention.segments.detection import Explanations, RecentReads
 from ...tracing.tracer import AbstractTracer, Camera
 from ..fading import faded
+from .likelihood import FilmedFrames, moved_by_flow, read_nats
 from .pieces import PieceFrames, frame_of
 from .teachers import Teacher
 
@@ -35,7 +36,8 @@ class HindsightSettings:
     clip_norm: float = 0.3  # of a piece's gradient, at most: some have 50 times the median
     piece_frames: int = 256  # a recording is cut into pieces of at most so many frames
     teacher: Teacher = "smoother"  # or labels: the true masks of simulated recordings, to compare with
-    learn: Literal["all", "masks", "confidence"] = "all"  # masks: all stages but detection; confidence: detection
+    # masks: all stages but detection; confidence: detection; reads: the reader's noise, and with `joint` the flow
+    learn: Literal["all", "masks", "confidence", "reads"] = "all"
     controls: float = 0.0  # of the confidence: fraction of reads taken to belong to nothing in view; 0: none
     term_norms: ClassVar[bool] = False  # there is one term
 
@@ -54,7 +56,7 @@ class HindsightSettings:
     @property
     def needs_controls(self) -> bool:
         """Whether control reads take part."""
-        return self.learn != "masks" and self.controls > 0
+        return self.learn in ("all", "confidence") and self.controls > 0
 
     def weights(self) -> dict[str, float]:
         """The weight of each term."""
@@ -66,10 +68,18 @@ class HindsightSettings:
         return jax.tree.map(lambda leaf: leaf * jnp.minimum(1.0, self.clip_norm / jnp.maximum(norm, 1e-12)), gradient)
 
     def terms(
-        self, tracer: AbstractTracer, camera: Camera, frames: PieceFrames
+        self, tracer: AbstractTracer, camera: Camera, frames: PieceFrames | FilmedFrames
     ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
         """The loss of a piece, and what it consists of."""
         assert isinstance(tracer, TagAttention)
+        if isinstance(frames, FilmedFrames):
+            frames = moved_by_flow(tracer.segments, camera, frames)
+        if self.learn == "reads":
+            nats, number = read_nats(
+                tracer.reader, camera.antennas_m.shape[0], frames, frames.present & (frames.confidence > self.sure)
+            )
+            mean = safe_divide(jnp.sum(nats), jnp.sum(number))
+            return {"hindsight": -mean}, {"nats": mean}
         sums, loss = hindsight_sums(tracer, camera, frames, self), jnp.zeros(())
         if self.learn != "confidence":
             loss = loss + safe_divide(sums.missed, sums.num_there)
