@@ -166,7 +166,7 @@ class DriftMeter:
             self._first = (sensor_ns, arrival_ns)
         at_s = (arrival_ns - self._first[1]) * 1e-9
         delay_s = at_s - (sensor_ns - self._first[0]) * 1e-9
-        if abs(delay_s) > 1.0 + 1e-3 * at_s:  # the clock was set anew
+        if not delay_s + 1e-3 * at_s > -1.0 or delay_s > _QUEUE_S + 1e-3 * at_s:  # the clock was set anew
             self._groups, self._first, self._until_s, self._width_s = [], (sensor_ns, arrival_ns), 0.0, _GROUP_S
             return
         if not self._groups or at_s >= self._until_s:
