@@ -98,3 +98,27 @@ async def take(
 
 def keys(reads: Sequence[CapturedRead]) -> list[tuple[str, int, int]]:
     return [(read.epc, read.antenna, read.reader_time_ns) for read in reads]
+
+
+def taken_by_a_busy_host(leaves_ns: np.ndarray, seed: int, *, load: int = 2) -> np.ndarray:
+    """When a host takes what leaves the network, which runs the program only now and then: times of arrival.
+
+    Its pauses have a heavy tail, up to 1.5 s, and what comes in a pause is taken at once after it. `load` 0: pauses of some
+    milliseconds; 1: of some 10 ms, and long ones among them; 2: of 25 ms at least, and moments of a millisecond between them. The
+    load changes every few seconds.
+    """
+    random, now_ns = np.random.default_rng([seed, 77]), float(leaves_ns.min()) - 1e8
+    begins, ends, until_ns, kind = [], [], now_ns, 0
+    while now_ns < float(leaves_ns.max()) + 2e9:
+        if now_ns >= until_ns:
+            kind, until_ns = int(random.integers(min(load, 1), load + 1)), now_ns + random.uniform(0.5e9, 4e9)
+        runs_ms = random.exponential((20.0, 4.0, 1.0)[kind])
+        tail = random.pareto((1.5, 1.1, 1.2)[kind])
+        pause_ms = min((tail, 8 * (tail + 0.2), 25 * (tail + 1))[kind], 1500.0)
+        begins.append(now_ns)
+        ends.append(now_ns + 1e6 * runs_ms)
+        now_ns = ends[-1] + 1e6 * pause_ms
+    place = np.searchsorted(begins, leaves_ns, side="right") - 1
+    taken_ns = np.where(leaves_ns < np.array(ends)[place], leaves_ns, np.array(begins)[place + 1])
+    late_ns = 1e5 + random.exponential(1.5e5, len(leaves_ns))
+    return np.maximum.accumulate(np.rint(taken_ns + late_ns).astype(np.int64))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from capture_scenes import small_recording
+from capture_scenes import ORIGIN_NS, reads_table, small_recording, taken_by_a_busy_host
 from test_segment_tracer import CONF, scene
 
 from tagjax.core.errors import RecordingError
@@ -21,6 +21,7 @@ from tagjax.live.sensors import SensorStream
 from tagjax.live.stream import run_stream
 from tagjax.recording import TagReads
 from tagjax.recording.capture.camera import CameraError
+from tagjax.recording.capture.emulation import EmulatedReads, EmulatorSettings
 from tagjax.recording.capture.settings import SensorConfig
 from tagjax.recording.store import open_recording, save_recording
 
@@ -50,6 +51,32 @@ def test_times_are_those_of_the_host_under_drift_and_jitter(drift_ppm):
     assert np.abs(error_s[true_s > 10]).max() < 1e-3
     assert np.abs(error_s[true_s > 0.5]).max() < 3e-3  # before the drift is known
     assert clock.num_jumps == 0
+
+
+@pytest.mark.parametrize("load", [0, 1, 2])
+def test_a_busy_host_moves_no_clock(load):
+    """200 ppm, a network that is held up for 20 ms, pauses of the host of up to 1.5 s: to a millisecond after ten seconds."""
+    for seed in range(6):
+        network = EmulatorSettings(drift_ppm=200.0, jitter_s=0.02, seed=seed)
+        table = EmulatedReads(reads_table(40.0, 76.0, seed=seed), ORIGIN_NS, network)
+        arrivals_ns = taken_by_a_busy_host(table.leaves_ns, seed, load=load)
+        clock, shown_ns = OnlineClock(), table.reader_time_ns(table.since_ns, 0)
+        found = np.array([clock.host_ns(int(a), int(b)) for a, b in zip(shown_ns, arrivals_ns, strict=True)])
+        assert np.abs(found - table.since_ns)[table.since_ns > 10**10].max() < 1e6
+        assert clock.num_jumps == 0
+
+
+@pytest.mark.parametrize("step_s", [-500.0, -2.0, 0.5, 500.0])
+def test_a_step_of_the_clock_is_one_jump(step_s):
+    true_s = np.arange(0, 40, 0.01)
+    before, after = (
+        times(true_s, delays(len(true_s)), 100.0),
+        times(true_s, delays(len(true_s)), 100.0, -3600.0 + step_s),
+    )
+    clock = OnlineClock()
+    found = np.array([clock.host_ns(*one) for one in [*before[:2000], *after[2000:]]])
+    assert clock.num_jumps == 1
+    assert np.abs(found * 1e-9 - true_s)[-500:].max() < 1e-3
 
 
 def test_a_clock_that_is_set_anew_is_learnt_anew():

@@ -1,7 +1,8 @@
 """An antenna's position in the camera frame, from a recording in which one tag is moved about.
 
 The tag's path is the true one where the recording holds it, or that of the object which the tracer finds. The fit begins at the
-best places of a grid, by the phases' changes within dwells, and is refined from each (`radio.antenna_position`).
+best places of a grid and is refined from each: by all phases together, with one offset that is affine in the carrier's frequency
+(`radio.affine_position`), or by the phases' changes within dwells or channels (`radio.antenna_position`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError
+from ..radio.affine_position import find_position
 from ..radio.antenna_position import AntennaPosition, PathReads, fit_position, position_coherence
 from ..radio.noise import thermal_sigma_rad
 from ..recording import Recording, RecordingError, TagReads
@@ -31,6 +33,8 @@ MAX_DWELL_S = 0.5
 MIN_READS = 40
 _GAP_S = 0.25
 _NUM_STARTS = 24
+_READ_SPREAD_RAD = 0.03  # of a read beside thermal noise, where reflections are counted by themselves
+_MIN_COHERENCE = 0.5
 _APART_M = 0.15
 _SMOOTH_S = 0.15
 
@@ -47,7 +51,8 @@ class AntennaConfig:
     tracer: Mapping[str, Any]  # settings as under conf/tracer; used where the path is traced
     antenna: int = 1  # counted from 1
     path: Literal["auto", "truth", "traced"] = "auto"  # auto: truth where the recording holds it
-    offsets: Literal["dwell", "channel"] = "dwell"  # reads that share a phase offset
+    # of the phases: affine in the carrier's frequency throughout, or one for each dwell, or for each channel
+    offsets: Literal["affine", "dwell", "channel"] = "affine"
     reach_m: float = 1.5  # the antenna lies within this distance of the camera along each axis
     step_m: float = 0.15  # of the grid of starts
     spread_rad: float = 0.1  # phase errors beside thermal noise: reflections
@@ -122,29 +127,71 @@ def find_antenna(recording: Recording, path_m: np.ndarray, config: AntennaConfig
             f"{recording.name}: {used.sum()} reads of {config.epc} through antenna {config.antenna} at times at which its path "
             f"is known; expected at least {MIN_READS}. Move the tag about in view for ten seconds or more."
         )
-    fits = _fits(reads[used], time_s[used], place_m[used], config)
-    best, rival = fits[0], next((fit for fit in fits[1:] if _differs(fit, fits[0])), None)
-    std_m = np.asarray(best.std_m, float)
+    find = _affine if config.offsets == "affine" else _by_groups
+    found = find(reads[used], time_s[used], place_m[used], config)
+    std_m = np.sqrt(np.diagonal(found.covariance_m2))
     if not np.all(std_m <= config.max_std_m):
         extent = _text(_three(np.ptp(place_m[used], axis=0)))
         raise RecordingError(
             f"{recording.name}: the antenna's position has standard deviations of {_text(_three(std_m))} m; expected at most "
             f"{config.max_std_m:g}. The tag moved by {extent} m along x, y, z. Move it farther, along all three axes and near the "
-            "antenna, for 20 s, with nothing in between; set max_std_m to accept."
+            "antenna, for a minute, with nothing in between; set max_std_m to accept."
         )
-    # A rival must explain the phases as well to a few times the cost's own spread.
-    close = rival is not None and float(rival.cost) < float(best.cost) * (1 + 4 / np.sqrt(used.sum()))
     return FoundAntenna(
-        position_m=_three(best.position_m),
+        position_m=_three(found.position_m),
         std_m=_three(std_m),
-        covariance_m2=tuple(_three(row) for row in np.asarray(best.covariance_m2)),
-        noise_rad=float(best.noise_rad),
+        covariance_m2=tuple(_three(row) for row in found.covariance_m2),
+        noise_rad=found.noise_rad,
         num_reads=int(used.sum()),
         path=source,
         extent_m=_three(np.ptp(place_m[used], axis=0)),
-        rival_m=_three(rival.position_m) if rival is not None and close else None,
+        rival_m=None if found.rival_m is None else _three(found.rival_m),
         recorded_m=_three(recording.antennas_m[config.antenna - 1]),
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """A fitted place."""
+
+    position_m: np.ndarray
+    covariance_m2: np.ndarray
+    noise_rad: float
+    rival_m: np.ndarray | None
+
+
+def _affine(reads: TagReads, time_s: np.ndarray, place_m: np.ndarray, config: AntennaConfig) -> _Place:
+    """The place by all reads together. Raises `RecordingError` where they agree with none."""
+    own = path_reads(reads, time_s, place_m, offsets="channel", spread_rad=_READ_SPREAD_RAD)
+    found = find_position(own, _grid(config))
+    if found is None or found.coherence < _MIN_COHERENCE:
+        agree = "nothing" if found is None else f"{found.coherence:.2f}"
+        raise RecordingError(
+            f"the phases agree by {agree} with the best place of the antenna; expected {_MIN_COHERENCE:g} of 1. The path is wrong, much "
+            "of it is hidden from the antenna, or the reader's offsets differ in each dwell: move the tag nearer, in the open, or "
+            "set offsets=dwell."
+        )
+    return _Place(found.best.position_m, found.covariance_m2, found.best.noise_rad, found.rival_m)
+
+
+def _by_groups(reads: TagReads, time_s: np.ndarray, place_m: np.ndarray, config: AntennaConfig) -> _Place:
+    """The place by changes within dwells, or within channels."""
+    fits = _fits(reads, time_s, place_m, config)
+    best, rival = fits[0], next((fit for fit in fits[1:] if _differs(fit, fits[0])), None)
+    # A rival must explain the phases as well to a few times the cost's own spread.
+    close = rival is not None and float(rival.cost) < float(best.cost) * (1 + 4 / np.sqrt(len(time_s)))
+    return _Place(
+        np.asarray(best.position_m, float),
+        np.asarray(best.covariance_m2, float),
+        float(best.noise_rad),
+        np.asarray(rival.position_m, float) if rival is not None and close else None,
+    )
+
+
+def _grid(config: AntennaConfig) -> np.ndarray:
+    """Places at which the antenna may be, (places, 3)."""
+    along = np.arange(-config.reach_m, config.reach_m + 1e-9, config.step_m)
+    return np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _three(values: Any) -> tuple[float, float, float]:
@@ -159,8 +206,7 @@ def _differs(one: AntennaPosition, other: AntennaPosition) -> bool:
 def _fits(reads: TagReads, time_s: np.ndarray, place_m: np.ndarray, config: AntennaConfig) -> list[AntennaPosition]:
     """Fits from the best places of the grid, the one of lowest cost first."""
     dwells = path_reads(reads, time_s, place_m, offsets="dwell", spread_rad=config.spread_rad)
-    along = np.arange(-config.reach_m, config.reach_m + 1e-9, config.step_m)
-    grid = np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = _grid(config)
     found = np.asarray(_coherence(dwells, jnp.asarray(grid, jnp.float32)))
     starts = grid[np.argsort(-found)[:_NUM_STARTS]]
     fits = _refined(dwells, starts)

@@ -60,12 +60,10 @@ def reader_epoch(reader_ns: np.ndarray) -> str:
     return "2000" if first >= _YEAR_2000_NS else "1970"
 
 
-def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray, *, short_drift_error_s: float = 0.0) -> HostTimes:
+def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray) -> HostTimes:
     """The reader's times on the host's clock, without the jitter of the times of arrival.
 
-    Both are int64 nanoseconds, one for each row. The smallest latency remains in the result. A piece shorter than
-    `MIN_DRIFT_SPAN_S` gets a drift only where its 95 % interval, over half of the piece, is within `short_drift_error_s`: so
-    it is with many reads, whose times of arrival the host itself took. Raises `RecordingError` for
+    Both are int64 nanoseconds, one for each row. The smallest latency remains in the result. Raises `RecordingError` for
     fewer than two rows, different numbers of them, a clock that stands still, runs backwards or drifts by more than
     `MAX_DRIFT_PPM`, and if more than `MAX_SET_ASIDE` of the rows fit no clock.
     """
@@ -75,14 +73,14 @@ def to_host_clock(reader_ns: np.ndarray, arrival_ns: np.ndarray, *, short_drift_
         )
     reader, arrival = np.asarray(reader_ns, np.int64), np.asarray(arrival_ns, np.int64)
     order = np.arange(len(reader))
-    if max(_in_order(reader, _SWAPPED_S).mean(), _in_order(arrival, _LATE_S).mean()) < 1 - MAX_SET_ASIDE:
+    if max(rows_in_order(reader, _SWAPPED_S).mean(), rows_in_order(arrival, _LATE_S).mean()) < 1 - MAX_SET_ASIDE:
         order = np.lexsort((reader, arrival))  # the table is sorted by something else, by EPC for example
     reader, arrival = reader[order], arrival[order]
     repeats = _repeats(reader, arrival)
     time_ns, usable = arrival.copy(), np.zeros(len(reader), bool)
     fits = []
     for rows in continuous_pieces(reader, arrival):
-        fit = _fit(reader[rows], arrival[rows], short_drift_error_s)
+        fit = _fit(reader[rows], arrival[rows])
         time_ns[rows], usable[rows] = fit.to_host(reader[rows]), fit.usable
         fits.append(fit)
     usable &= ~repeats
@@ -144,9 +142,9 @@ class _Fit:
         return reader + round(piece.offset_s * 1e9) + np.rint(drift_ns).astype(np.int64)
 
 
-def _fit(reader: np.ndarray, arrival: np.ndarray, short_drift_error_s: float) -> _Fit:
+def _fit(reader: np.ndarray, arrival: np.ndarray) -> _Fit:
     """Offset and drift of one piece, and which of its rows fit them."""
-    in_order = _in_order(reader, _SWAPPED_S) & _in_order(arrival, _LATE_S)
+    in_order = rows_in_order(reader, _SWAPPED_S) & rows_in_order(arrival, _LATE_S)
     if 2 * in_order.sum() < len(reader) and len(reader) > 2:
         raise RecordingError(_no_clock(reader, arrival, "its times do not increase"))
     # Integers are subtracted before they become float64 seconds, which resolve 1.7e9 s to 0.2 us only.
@@ -158,9 +156,8 @@ def _fit(reader: np.ndarray, arrival: np.ndarray, short_drift_error_s: float) ->
     line = _envelope_line(since_s[in_order], delay_s[in_order])
     span_s = float(np.ptp(since_s[in_order]))
     limit, is_long = MAX_DRIFT_PPM * 1e-6, span_s >= MIN_DRIFT_SPAN_S
-    is_narrow = 0 < (line.high - line.low) * span_s / 4 <= short_drift_error_s
-    measured = line.num_points >= _MIN_POINTS and (is_long or is_narrow)
-    if not (is_long or measured):  # there a drift is not fitted, and must not matter
+    measured = line.num_points >= _MIN_POINTS and is_long
+    if not is_long:  # there a drift is not fitted, and must not matter
         limit = min(limit, 2 * MAX_UNCERTAINTY_S / max(span_s, 1e-9))
     if line.low > limit or line.high < -limit:
         raise RecordingError(_no_clock(reader[in_order], arrival[in_order], f"a drift of {1e6 * line.slope:.0f} ppm"))
@@ -184,7 +181,7 @@ def _fit(reader: np.ndarray, arrival: np.ndarray, short_drift_error_s: float) ->
     return _Fit(piece, in_order & (late_s > -_EARLY_S) & is_known, line.spread_s)
 
 
-def _in_order(time_ns: np.ndarray, tolerance_s: float) -> np.ndarray:
+def rows_in_order(time_ns: np.ndarray, tolerance_s: float) -> np.ndarray:
     """Rows whose time follows those before it: the longest sequence that never falls, and what is close to it.
 
     A wrong time is out of order, whatever the delay of its arrival is.
