@@ -135,28 +135,31 @@ def _padded(rows: Sequence[Any]) -> PieceFrames:
     """The rows on a time axis, padded: with their last frame, at which then no tag is present and no read arrives."""
     after = -len(rows) % _FRAMES
     stacked = jax.tree.map(lambda *leaves: np.stack([*leaves, *leaves[-1:] * after]), *rows)
-    time_s, depth_m, found, arrivals, radio, present, target, confidence, control = stacked
+    time_s, _, _, arrivals, _, present, _, _, control = stacked
     of_control = [] if control is None else [control.present, control.arrivals.valid]
     for there in (present, arrivals.valid, *of_control):
         there[len(rows) :] = False
     step_s = (time_s[len(rows) - 1] - time_s[0]) / np.float32(max(len(rows) - 1, 1))
     time_s[len(rows) :] += step_s * np.arange(1, after + 1, dtype=np.float32)
-    more = _padded_tags(present.shape[1]) - present.shape[1]
+    frames = PieceFrames(*jax.tree.map(jnp.asarray, stacked))
+    return with_tags(frames, _padded_tags(present.shape[1]))
 
-    def more_tags(leaf: np.ndarray, fill: float = 0.0) -> Array:
-        widths = [(0, 0), (0, more), *[(0, 0)] * (leaf.ndim - 2)]
-        return jnp.asarray(np.pad(leaf, widths, constant_values=fill))
 
-    return PieceFrames(
-        time_s=jnp.asarray(time_s),
-        depth_m=jnp.asarray(depth_m),
-        found=jax.tree.map(jnp.asarray, found),
-        arrivals=jax.tree.map(jnp.asarray, arrivals),
-        radio=RadioWindow(more_tags(radio.relative_m), more_tags(radio.std_m, np.inf)),
-        present=more_tags(present),
-        target=more_tags(target),
-        confidence=more_tags(confidence),
-        control=jax.tree.map(jnp.asarray, control),
+def with_tags(frames: PieceFrames, num_tags: int) -> PieceFrames:
+    """The frames with places for so many tags; those behind its own hold none."""
+    more = num_tags - frames.present.shape[1]
+
+    def padded(leaf: Array, fill: float = 0.0) -> Array:
+        return jnp.pad(
+            leaf, [(0, 0), (0, more), *[(0, 0)] * (leaf.ndim - 2)], constant_values=jnp.asarray(fill, leaf.dtype)
+        )
+
+    return dataclasses.replace(
+        frames,
+        radio=RadioWindow(padded(frames.radio.relative_m), padded(frames.radio.std_m, np.inf)),
+        present=padded(frames.present),
+        target=padded(frames.target),
+        confidence=padded(frames.confidence),
     )
 
 
