@@ -24,7 +24,7 @@ from tagjax.recording.store import save_recording
 from tagjax.training.config import TrainConfig
 from tagjax.training.hindsight import HindsightSettings, Piece, PieceFiles, PieceWindows, segment_pieces
 from tagjax.training.hindsight.likelihood import FilmedFrames, moved_by_flow, read_nats
-from tagjax.training.run import run_training
+from tagjax.training.run import initial_state, run_training, validation_metrics
 
 SURE = 0.9
 READS = HindsightSettings(learn="reads")
@@ -215,6 +215,13 @@ def _filmed(num_frames: int = 46) -> Recording:
     whole = _panned(num_frames, rate_hz=15.0)
     depth = np.asarray(whole.depth)
     return dataclasses.replace(whole, depth=depth + np.linspace(0, 0.6, depth.shape[2], dtype=depth.dtype))
+
+
+def test_validation_recordings_without_a_window_give_no_numbers(tmp_path: Path) -> None:
+    """A mask may be sure nowhere in them: the run then ends without a score, not with an error."""
+    config = _config(tmp_path / "a.zarr", joint=JOINT)
+    none = PieceWindows.of(PieceFiles(tmp_path / "pieces"), [], length=6, sure=SURE)
+    assert validation_metrics(initial_state(config)[0], none, config) == {}
 
 
 @pytest.mark.ci

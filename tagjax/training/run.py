@@ -227,10 +227,11 @@ def _report(
 
 
 def validation_metrics(state: TrainState, held_out: Iterable[ClipLike], config: TrainConfig) -> dict[str, float]:
-    """Mean of every term and diagnostic over the held-out samples, always with the same random numbers."""
+    """Mean of every term and diagnostic over the held-out samples, always with the same random numbers; empty without samples."""
     key = jax.random.PRNGKey(config.seed)
     values = [clip_loss(state.model, sample.camera, sample.frames, key, config.learned) for sample in held_out]
-    return {name: float(np.mean([float(sample[name]) for sample in values])) for name in values[0]}
+    names = values[0] if values else ()
+    return {name: float(np.mean([float(sample[name]) for sample in values])) for name in names}
 
 
 def _describe(console: Console, training: Sequence[Recording], validation: Sequence[Recording]) -> None:
