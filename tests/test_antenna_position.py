@@ -176,6 +176,14 @@ def _moved_about(room: str, seed: int, duration_s: float = 20.0) -> tuple[TagRea
     return own, place_m, view.to_camera(np.asarray(scenario.antennas_m, float))[0]
 
 
+def _error(name: str, found: Any, antenna_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A fit's error and standard deviations along x, y, z, which are printed as well."""
+    error_m = np.asarray(found.position_m) - antenna_m
+    std_m = np.sqrt(np.diagonal(np.asarray(found.covariance_m2)))
+    print(f"{name}: error {np.linalg.norm(error_m):.3f} m, standard deviations {np.round(std_m, 3)} m")
+    return error_m, std_m
+
+
 def affine(**settings: Any) -> AntennaConfig:
     """As the command has it."""
     return AntennaConfig(recording="", epc=EPC, tracer=TRACER, **settings)
@@ -209,8 +217,7 @@ def test_among_reflections_the_position_is_right_to_centimetres(room: str, seed:
     pytest.importorskip("mujoco")
     own, place_m, antenna_m = _moved_about(room, seed)
     best = antenna_position._affine(own, own.time_ns * 1e-9, place_m, affine())
-    error_m, std_m = best.position_m - antenna_m, np.sqrt(np.diagonal(best.covariance_m2))
-    print(f"{room} {seed}: error {np.linalg.norm(error_m):.3f} m, standard deviations {np.round(std_m, 3)} m")
+    error_m, std_m = _error(f"{room} {seed}", best, antenna_m)
     assert np.linalg.norm(error_m) < 0.06
     assert (
         error_m @ np.linalg.solve(best.covariance_m2, error_m) < 12.8
@@ -227,7 +234,6 @@ def test_in_simulated_rooms_the_uncertainty_covers_the_error(room: str, seed: in
     pytest.importorskip("mujoco")
     own, place_m, antenna_m = _moved_about(room, seed)
     best = antenna_position._fits(own, own.time_ns * 1e-9, place_m, config(reach_m=0.9, step_m=0.3))[0]
-    error_m, std_m = np.asarray(best.position_m) - antenna_m, np.asarray(best.std_m)
-    print(f"{room} {seed}: error {np.linalg.norm(error_m):.3f} m, standard deviations {np.round(std_m, 3)} m")
+    error_m, std_m = _error(f"{room} {seed}", best, antenna_m)
     assert np.all(np.abs(error_m) < 2.5 * std_m)
     assert np.max(std_m) > 0.2 or np.linalg.norm(error_m) < 0.2
