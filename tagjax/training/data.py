@@ -130,7 +130,7 @@ def _pieces(
     return TrainingData(_stream(windows, batch_size, config), batch_size, held_out, score, remove)
 
 
-def _stream(samples: PieceFiles | PieceWindows, batch_size: int, config: TrainConfig) -> Stream:
+def _stream(samples: Sequence[ClipLike] | PieceFiles | PieceWindows, batch_size: int, config: TrainConfig) -> Stream:
     """The samples again and again, shuffled where a step does not take all of them."""
     dataset = grain.MapDataset.source(samples)
     if batch_size < len(samples):
