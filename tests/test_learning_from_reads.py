@@ -81,7 +81,7 @@ def _by_hand(reader: ReaderModel, piece: Piece, sure: np.ndarray, tag: int) -> t
         if not counts:
             phasor = 0j
         since_s = float(frames.time_s[time])
-    return nats, number
+    return float(nats), number
 
 
 @pytest.mark.parametrize("gap", [False, True])
@@ -147,8 +147,8 @@ def test_flow_moves_the_segments_as_tracing_does(piece: Piece) -> None:
     body = np.asarray(frames.target[30:60]).max(axis=1) > 0.9
     both = body & np.asarray(frames.found.known[30:60] & moved.found.known[30:60])
     assert both.sum() > 100
-    steps = [np.moveaxis(np.asarray(one.found.increment_m[30:60]), 1, 2)[both] for one in (moved, frames)]
-    np.testing.assert_allclose(*steps, atol=1e-3)
+    ours, traced = (np.moveaxis(np.asarray(one.found.increment_m[30:60]), 1, 2)[both] for one in (moved, frames))
+    np.testing.assert_allclose(ours, traced, atol=1e-3)
     assert not np.any(moved.found.known[0, 1:])
 
     def loss(flow: Any) -> Any:
