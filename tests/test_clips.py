@@ -112,14 +112,14 @@ def _same_radio(one, other) -> None:
     np.testing.assert_array_equal(one.frames.reads.phase_rad, other.frames.reads.phase_rad)
 
 
-def test_only_the_antenna_with_the_most_reads_counts(recording: Recording) -> None:
+def test_the_busiest_antenna_is_the_one_with_the_most_reads(recording: Recording) -> None:
     both = _two_antennas(recording, 0.6)
     assert both.reads.antenna[0] == 2
     surplus = both.reads.num_reads - recording.reads.num_reads
     with pytest.warns(
         RecordingWarning, match=rf"{surplus} of {both.reads.num_reads} reads are unused .* to antenna 1\."
     ):
-        clip = load_clip(both, 4, 20, **SMALL)
+        clip = load_clip(both, 4, 20, antennas="busiest", **SMALL)
     np.testing.assert_array_equal(clip.camera.antennas_m, ANTENNAS_M[:1])
     _same_radio(clip, load_clip(recording, 4, 20, **SMALL))
     truth = np.diff(np.stack([recording.truth.tag_range_m[epc] for epc in clip.epcs], axis=1), axis=0)[3:]
@@ -129,7 +129,7 @@ def test_only_the_antenna_with_the_most_reads_counts(recording: Recording) -> No
 
 def test_each_antenna_s_distances_are_those_that_it_alone_would_give(recording: Recording) -> None:
     both = _two_antennas(recording, 0.9)
-    clip = load_clip(both, 4, 20, antennas="all", **SMALL)
+    clip = load_clip(both, 4, 20, **SMALL)  # all antennas
     np.testing.assert_allclose(clip.camera.antennas_m, ANTENNAS_M[:2], atol=1e-6)
     for place in range(2):
         with pytest.warns(RecordingWarning, match=rf"to antenna {place + 1}\. `antennas=all` uses every antenna"):
@@ -180,8 +180,10 @@ def test_antennas_without_place_are_passed_over(recording: Recording) -> None:
         load_clip(moved, 0, 6, **SMALL)
     both = _two_antennas(recording, 0.4)
     swapped = dataclasses.replace(both.reads, antenna=(3 - both.reads.antenna).astype(np.int16))  # most are now 2's
-    with pytest.warns(RecordingWarning, match=r"to antenna 1\."):
-        assert choose_antennas(dataclasses.replace(both, reads=swapped, antennas_m=ANTENNAS_M[:1]), ["tag-a"]) == (1,)
+    placed = dataclasses.replace(both, reads=swapped, antennas_m=ANTENNAS_M[:1])
+    for antennas, advice in (("all", "add those of the others"), ("busiest", "`antennas=all` uses every antenna")):
+        with pytest.warns(RecordingWarning, match=rf"to antenna 1\. .*{advice}"):
+            assert choose_antennas(placed, ["tag-a"], antennas) == (1,)
 
 
 def test_one_antenna_serves_all_tags_and_unread_tags_are_reported(recording: Recording) -> None:
@@ -189,7 +191,7 @@ def test_one_antenna_serves_all_tags_and_unread_tags_are_reported(recording: Rec
     apart = (both.reads.epc == "tag-b") == (both.reads.antenna == 2)  # tag-a by antenna 1 only, tag-b by antenna 2
     split = both.with_reads(both.reads[apart][:-20])  # as many reads of both: the first antenna
     with pytest.warns(RecordingWarning, match=r"to antenna 1\. .* No read is left of: tag-b"):
-        clip = load_clip(split, 0, 12, **SMALL)
+        clip = load_clip(split, 0, 12, antennas="busiest", **SMALL)
     at = clip.epcs.index("tag-b")
     np.testing.assert_array_equal(clip.camera.antennas_m, ANTENNAS_M[:1])
     assert np.isinf(np.asarray(clip.frames.radio.std_m)[:, at]).all()
@@ -202,7 +204,7 @@ def test_reads_of_unknown_carrier_do_not_choose_the_antenna(recording: Recording
     carrier = np.where(both.reads.antenna == 1, np.nan, both.reads.carrier_hz)
     unknown = both.with_reads(dataclasses.replace(both.reads, carrier_hz=carrier))
     with pytest.warns(RecordingWarning, match=r"to antenna 2\."):
-        assert choose_antennas(unknown, unknown.reads.epcs) == (2,)
+        assert choose_antennas(unknown, unknown.reads.epcs, "busiest") == (2,)
 
 
 def test_the_true_distances_may_stand_in_for_the_radio(recording: Recording) -> None:
@@ -303,7 +305,7 @@ def test_of_many_tags_the_one_that_moves_most_is_kept_and_others_by_chance() -> 
     elsewhere = [dataclasses.replace(one, antenna=np.full(one.num_reads, 2, np.int16)) for one in still]
     apart = dataclasses.replace(recording, reads=join_reads([reads, *elsewhere]), antennas_m=ANTENNAS_M)
     with pytest.warns(RecordingWarning, match=r"to antenna 2\."):
-        drawn = next(iter(clip_dataset([apart], max_tags=1, min_motion=0.0, **settings)))
+        drawn = next(iter(clip_dataset([apart], max_tags=1, min_motion=0.0, antennas="busiest", **settings)))
     assert len(drawn.epcs) == 1
     np.testing.assert_allclose(drawn.camera.antennas_m, ANTENNAS_M[1:2], atol=1e-6)
     assert len(next(iter(clip_dataset([both], max_tags=20, **settings))).epcs) == 8

@@ -15,6 +15,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 import synthetic_clips as synthetic
+from omegaconf import OmegaConf
 
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.run import EvaluateConfig, run_evaluation
@@ -22,12 +23,10 @@ from tagjax.recording import RecordingError, TagReads
 from tagjax.recording.loading import VirtualTagSettings, with_virtual_tags
 from tagjax.recording.reads import join_reads
 from tagjax.recording.store import save_recording
-from tagjax.tagattention import TagAttention
-from tagjax.tagattention.literal import TagAttentionLiteral
-from tagjax.tagattention.tracer_settings import make_tracer
+from tagjax.tagattention.tracer_settings import make_tracer, tracer_clips
 from tagjax.training import run as run_module
 from tagjax.training.config import TrainConfig
-from tagjax.training.evaluate import antennas_for, parameters
+from tagjax.training.evaluate import parameters
 from tagjax.training.loop import TrainingResult
 from tagjax.training.run import run_training
 from tagjax.training.state import TrainState
@@ -256,7 +255,9 @@ def test_reads_of_unlike_conventions_are_not_joined() -> None:
     assert len(join_reads([timed, timed[:3]]).reader_time_ns) == one.num_reads + 3
 
 
-def test_a_tracer_of_one_antenna_gets_the_given_one_or_else_the_busiest() -> None:
-    one, several = TagAttentionLiteral(), TagAttention()
-    assert [antennas_for(one, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), None, None]
-    assert [antennas_for(several, asked) for asked in (None, (2,), (1, 2), "all")] == [None, (2,), (1, 2), "all"]
+@pytest.mark.parametrize("name", ["tagattention_literal", "tagattention_published"])
+def test_configured_tracers_of_one_antenna_use_the_busiest(name: str) -> None:
+    settings = OmegaConf.to_container(OmegaConf.load(ROOT / "conf" / "tracer" / f"{name}.yaml"))
+    assert isinstance(settings, dict)
+    assert tracer_clips(settings).antennas == "busiest"  # type: ignore[arg-type]
+    assert tracer_clips({}).antennas == "all"

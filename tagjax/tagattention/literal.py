@@ -37,8 +37,6 @@ class LiteralState(eqx.Module):
 class TagAttentionLiteral(AbstractTracer):
     """Eqs. 3-7 with the paper's constants. `softness` > 0 relaxes every hard step; 0 is the paper."""
 
-    one_antenna = True
-
     alpha_m2: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=5e-4)
     beta: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.8)
     v0_m_s: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, jnp.float32), default=0.1)
@@ -61,7 +59,9 @@ class TagAttentionLiteral(AbstractTracer):
         height, width = frame.depth_m.shape
         num_tags, num_antennas, num_window = frame.radio.relative_m.shape
         if num_antennas != 1:
-            raise ValueError(f"The paper's tracer knows one antenna; the clip has {num_antennas}. Set antennas to one.")
+            raise ValueError(
+                f"The paper's tracer knows one antenna; the clip has {num_antennas}. Set clips.antennas=busiest, or to one of them."
+            )
         return LiteralState(
             motion=empty_motion(height, width, num_window),
             time_s=jnp.broadcast_to(frame.time_s, (num_window,)),

@@ -26,8 +26,8 @@ from .tracer import Camera, Frame
 Estimator = Literal["robust", "published", "published_causal", "literal", "truth"]
 """Range estimator; `truth` uses the true ranges of a simulated recording, to measure what radio errors cost."""
 
-Antennas = tuple[int, ...] | Literal["all"] | None
-"""Antennas whose reads are used, counted from 1; None is the antenna with the most reads."""
+Antennas = tuple[int, ...] | Literal["all", "busiest"]
+"""Antennas whose reads are used: numbers from 1, all that have a position, or the one with the most reads."""
 
 _TRUTH_STD_M = 1e-3
 MAX_ARRIVALS = 64
@@ -65,12 +65,12 @@ def window_frames(seconds: float, frame_rate_hz: float) -> int:
     return max(2, 1 + round(seconds * frame_rate_hz)) if np.isfinite(frame_rate_hz) else 2
 
 
-def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antennas = None) -> tuple[int, ...]:
-    """The antennas (counted from 1) to which ranges are measured: the given ones, all, or the one with the most reads (None).
+def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antennas = "all") -> tuple[int, ...]:
+    """The antennas (counted from 1) to which ranges are measured: the given ones, all, or the busiest, with the most reads.
 
     "all" are the antennas that have a position in `antennas_m` and have read one of the tags. A given antenna must have a
-    position and have read any tag. None compares the counts of reads with known carrier first; of equal antennas it takes
-    the first. Warns (`RecordingWarning`) with the number of reads that are then unused. Raises `RecordingError` where no
+    position and have read any tag. "busiest" compares the counts of reads with known carrier first; of equal antennas it
+    takes the first. Warns (`RecordingWarning`) with the number of reads that are then unused. Raises `RecordingError` where no
     antenna is left.
     """
     reads = recording.reads[np.isin(recording.reads.epc, list(epcs))]
@@ -78,7 +78,7 @@ def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antenna
     made = ", ".join(f"{count} of antenna {port}" for port, count in zip(ports, counts, strict=True)) or "none"
     num_placed = len(recording.antennas_m)
     placed = tuple(int(port) for port in ports if 1 <= port <= num_placed)
-    if antennas is None or antennas == "all":
+    if antennas in ("all", "busiest"):
         if not placed:
             raise RecordingError(
                 f"{recording.name}: found reads: {made}; antennas_m holds positions of antennas 1 to {num_placed}. "
@@ -101,7 +101,12 @@ def choose_antennas(recording: Recording, epcs: Sequence[str], antennas: Antenna
         unread = [epc for epc in epcs if not np.any((reads.epc == epc) & used)]
         warnings.warn(
             f"{recording.name}: {np.sum(~used)} of {reads.num_reads} reads are unused (reads: {made}): ranges are measured to "
-            f"antenna {', '.join(map(str, chosen))}. `antennas=all` uses every antenna that has a position."
+            f"antenna {', '.join(map(str, chosen))}. "
+            + (
+                f"antennas_m holds positions of antennas 1 to {num_placed}: add those of the others."
+                if antennas == "all"
+                else "`antennas=all` uses every antenna that has a position."
+            )
             + (f" No read is left of: {', '.join(unread)}." if unread else ""),
             RecordingWarning,
             stacklevel=3,
@@ -142,7 +147,7 @@ def load_clip(
     window_s: float | None = None,
     max_reads: int = 64,
     estimator: Estimator = "robust",
-    antennas: Antennas = None,
+    antennas: Antennas = "all",
     colour: bool = False,
 ) -> Clip:
     """Frames `start` to `stop` - 1 with the radio of the given tags (all that were read if None).
@@ -266,7 +271,7 @@ class ClipSettings:
     max_reads: int = 64  # reads of one tag in a window
     flow: str = "dis"
     estimator: Estimator = "robust"  # of the tags' distances
-    antennas: Antennas = None  # distances are to these: `all`, numbers from 1, or the one with the most reads if None
+    antennas: Antennas = "all"  # whose reads are used: all that have a position, numbers from 1, or the busiest
     length: int = 24  # frames of a training clip
     epcs: tuple[str, ...] | None = None  # all that were read
     min_motion: float = 0.1  # training clips without a tag whose reads show so much motion are not drawn; 0 draws all

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -124,9 +124,6 @@ class Trace(eqx.Module):
 
 class AbstractTracer(eqx.Module):
     """A tracing system as a state machine of fixed shapes: `init`, one `step` a frame, `finish`."""
-
-    one_antenna: ClassVar[bool] = False
-    """Whether the method uses the range to a single antenna only."""
 
     @abc.abstractmethod
     def init(self, camera: Camera, frame: Frame) -> Any:

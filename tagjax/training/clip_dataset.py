@@ -141,7 +141,7 @@ def clip_dataset(
     window_s: float | None = None,
     max_reads: int = 64,
     estimator: Estimator = "robust",
-    antennas: Antennas = None,
+    antennas: Antennas = "all",
     colour: bool = False,
     step: int | None = None,
     min_motion: float = 0.0,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from ..recording import Recording
 from ..report.report import overlay_folder, recording_names, write_report
 from ..report.stages import stage_picture, write_stages
 from ..report.video import overlay_video
-from ..tracing.clips import Antennas, ClipSettings, clip_loader, window_frames
+from ..tracing.clips import ClipSettings, clip_loader, window_frames
 from ..tracing.tracer import AbstractTracer
 
 
@@ -43,12 +42,6 @@ def smoothing_tracers(tracers: Mapping[str, AbstractTracer], settings: ScoreSett
     return names
 
 
-def antennas_for(tracer: AbstractTracer, antennas: Antennas) -> Antennas:
-    """The antennas that a tracer uses: only the one with the most reads (None) where it supports one and several are given."""
-    several = antennas == "all" or (antennas is not None and len(antennas) > 1)
-    return None if tracer.one_antenna and several else antennas
-
-
 def evaluate_tracers(
     tracers: Mapping[str, AbstractTracer],
     recordings: Sequence[Recording],
@@ -63,14 +56,12 @@ def evaluate_tracers(
 ) -> dict[str, Any]:
     """Run each tracer over each recording, write the report into `folder` and return its summary.
 
-    `own_clips` holds by tracer the clip settings that differ from `clips`. A tracer that supports one antenna uses the one with the most reads where `clips` has several. With `settings.smooth` the tracers
-    that support it are smoothed offline and get the suffix `_smoothed` in the report; the others run online. Raises
-    `ConfigError` where no tracer supports it.
+    `own_clips` holds by tracer the clip settings that differ from `clips`. With `settings.smooth` the tracers that support
+    it are smoothed offline and get the suffix `_smoothed` in the report; the others run online. Raises `ConfigError` where
+    no tracer supports it.
     """
-    chosen: dict[str, ClipSettings] = {}
-    for name, tracer in tracers.items():
-        common = dataclasses.replace(clips, antennas=antennas_for(tracer, clips.antennas))
-        chosen[name] = changed(common, (own_clips or {}).get(name, {}), where=f"clips of {name}")
+    own = own_clips or {}
+    chosen = {name: changed(clips, own.get(name, {}), where=f"clips of {name}") for name in tracers}
     smoothed = smoothing_tracers(tracers, settings)
     labels = {name: f"{name}_smoothed" if name in smoothed else name for name in tracers}
     work = [(name, number) for name in tracers for number in range(len(recordings))]

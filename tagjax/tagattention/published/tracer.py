@@ -59,8 +59,6 @@ def _scalar(value: float | Array) -> Float[Array, ""]:
 class TagAttentionPublished(AbstractTracer):
     """Eqs. 3-7 and the refinement. beta and v0 are the paper's; the other constants were chosen on training recordings."""
 
-    one_antenna = True
-
     alpha_m2: Float[Array, ""] = eqx.field(converter=_scalar, default=1e-3)
     beta: Float[Array, ""] = eqx.field(converter=_scalar, default=0.8)
     v0_m_s: Float[Array, ""] = eqx.field(converter=_scalar, default=0.1)
@@ -87,7 +85,7 @@ class TagAttentionPublished(AbstractTracer):
         num_tags, num_antennas, num_window = frame.radio.relative_m.shape
         if num_antennas != 1:
             raise ValueError(
-                f"The published tracer measures ranges to one antenna; the clip has {num_antennas}. Set clips.antennas to one."
+                f"The published tracer measures ranges to one antenna; the clip has {num_antennas}. Set clips.antennas=busiest, or to one of them."
             )
         return PublishedState(
             range_m=jnp.zeros((height, width)),
