@@ -189,6 +189,9 @@ def test_files_hold_the_pieces_and_are_made_once(piece: Piece, tmp_path: Path, m
     files = make()
     assert len(files) == 1
     assert files.num_sure(SETTINGS) > 60
+    other = dataclasses.replace(scene(70), name="other")
+    with pytest.raises(RecordingError, match=rf"found pieces of {piece.name}; expected those of other"):
+        files.made([other], TRACER, LOAD, epcs=None, num_frames=256)
     files.remove()
     assert not (tmp_path / "pieces").exists()
 
@@ -264,6 +267,9 @@ def test_a_run_learns_and_resumes(tmp_path: Path) -> None:
     assert _run(paths, tmp_path / "parts") == score
     whole, parts = (json.loads((tmp_path / name / "weights.json").read_text()) for name in ("whole", "parts"))
     assert whole["parameters"] == parts["parameters"]
+    kept = {"hindsight": {"pieces": str(tmp_path / "kept")}}
+    assert [_run(paths, tmp_path / name, **kept) for name in ("first", "second")] == [score, score]
+    assert len(PieceFiles(tmp_path / "kept" / "training")) == 1
 
 
 @pytest.mark.ci

@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from ..core.errors import RecordingError
+from ..core.folder_lock import locked_folder
 from ..core.progress import progress_lines
 from ..core.settings import ConfigError
 from ..core.stream import Stream
@@ -82,7 +83,7 @@ def _pieces(
     validation: Sequence[Recording],
     console: Console,
 ) -> TrainingData:
-    """The pieces of all recordings, written to `folder`/pieces where they are not there yet."""
+    """The pieces of all recordings, written to `settings.pieces`, or `folder`/pieces, where they are not there yet."""
     tracer = make_tracer(config.tracer, config.weights)
     if not isinstance(tracer, TagAttention):
         raise ConfigError(
@@ -94,10 +95,10 @@ def _pieces(
             f"hindsight: found {jax.process_count()} processes; expected one, with any number of devices. For several, "
             "objective=coherent."
         )
-    found = {}
-    with progress_lines(shown=config.loop.progress, console=console) as report:
+    root, found = Path(settings.pieces or folder / "pieces"), {}
+    with locked_folder(root), progress_lines(shown=config.loop.progress, console=console) as report:
         for kind, recordings in (("training", training), ("validation", validation)):
-            found[kind] = PieceFiles(folder / "pieces" / kind).made(
+            found[kind] = PieceFiles(root / kind).made(
                 recordings,
                 tracer,
                 clip_loader(config.data.clips),
@@ -114,7 +115,8 @@ def _pieces(
             f"{settings.teacher}), so there is nothing to learn. Give recordings in which tags move and are read."
         )
     console.print(f"{sure} masks to learn from, in {len(files)} pieces of recordings (teacher: {settings.teacher}).")
-    remove, score = PieceFiles(folder / "pieces").remove, "nats" if settings.learn == "reads" else "overlap"
+    remove = (lambda: None) if settings.pieces else PieceFiles(root).remove
+    score = "nats" if settings.learn == "reads" else "overlap"
     if config.joint is None:
         batch_size = config.loop.batch_size or len(files)
         return TrainingData(_stream(files, batch_size, config), batch_size, found["validation"], score, remove)

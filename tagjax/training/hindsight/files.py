@@ -13,6 +13,7 @@ import numpy as np
 import safetensors.numpy
 
 from ...core.array_file import named_arrays
+from ...core.errors import RecordingError
 from ...core.files import make_folder, remove, write_atomic
 from ...core.progress import OnProgress, unobserved
 from ...core.results import write_json
@@ -54,11 +55,18 @@ class PieceFiles:
         controls: bool = False,
         on_progress: OnProgress = unobserved,
     ) -> PieceFiles:
-        """The folder with the pieces of all recordings; those that it holds already are not computed again.
+        """The folder with the pieces of all recordings; those that it holds already are taken as they are.
 
-        With `controls` each piece has control reads (`control_of`). `on_progress` counts the recordings.
+        With `controls` each piece has control reads (`control_of`). `on_progress` counts the recordings. Raises
+        `RecordingError` where the folder holds pieces of other recordings.
         """
         make_folder(self.folder)
+        held, asked = self._recordings(), [recording.name for recording in recordings]
+        if held != asked[: len(held)]:
+            raise RecordingError(
+                f"{self.folder}: found pieces of {_listed(held)}; expected those of {_listed(asked)}, in this order. Give "
+                "the same recordings, or another folder."
+            )
         stage = f"{self.folder.name} recordings: segments and masks"
         for recording in recordings[len(self._index()) :]:
             tags, names, index = selected_tags(recording, epcs), [], self._index()
@@ -69,7 +77,7 @@ class PieceFiles:
             ):
                 names.append(f"{len(index):04d}-{len(names):03d}.safetensors")
                 _write(self.folder / names[-1], piece)
-            write_json(self.folder / _INDEX, [*index, names])
+            write_json(self.folder / _INDEX, {"recordings": asked[: len(index) + 1], "pieces": [*index, names]})
             on_progress(stage, len(index) + 1, len(recordings))
         return self
 
@@ -97,8 +105,20 @@ class PieceFiles:
 
     def _index(self) -> list[list[str]]:
         """The names of each recording's files."""
+        return self._content()["pieces"]
+
+    def _recordings(self) -> list[str]:
+        """The names of the recordings."""
+        return self._content()["recordings"]
+
+    def _content(self) -> dict[str, Any]:
         path = self.folder / _INDEX
-        return json.loads(path.read_text()) if path.exists() else []
+        return json.loads(path.read_text()) if path.exists() else {"recordings": [], "pieces": []}
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The names, in so few words that an error can hold them."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _write(path: Path, piece: Piece) -> None:

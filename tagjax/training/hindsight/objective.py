@@ -39,6 +39,7 @@ class HindsightSettings:
     # masks: all stages but detection; confidence: detection; reads: the reader's noise, and with `joint` the flow
     learn: Literal["all", "masks", "confidence", "reads"] = "all"
     controls: float = 0.0  # of the confidence: fraction of reads taken to belong to nothing in view; 0: none
+    pieces: str | None = None  # folder that keeps the pieces for later runs; None: the run folder, until the run ends
     term_norms: ClassVar[bool] = False  # there is one term
 
     def __post_init__(self) -> None:
