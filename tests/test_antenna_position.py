@@ -189,14 +189,18 @@ def affine(**settings: Any) -> AntennaConfig:
     return AntennaConfig(recording="", epc=EPC, tracer=TRACER, **settings)
 
 
+def _affine_phases(own: TagReads) -> np.ndarray:
+    """Phases along the path with one offset, which has a slope over carriers."""
+    range_m = np.linalg.norm(path(own.time_ns * 1e-9) - ANTENNA_M, axis=1)
+    phase = 4 * np.pi * own.carrier_hz * range_m / 299792458.0 - 3.4e-7 * (own.carrier_hz - 915e6)
+    return phase % (2 * np.pi)
+
+
 def test_one_affine_offset_gives_the_position_exactly_without_noise() -> None:
     """Offsets with a slope over carriers, and pi flips."""
     own = reads()
-    time_s = own.time_ns * 1e-9
-    range_m = np.linalg.norm(path(time_s) - ANTENNA_M, axis=1)
-    phase = 4 * np.pi * own.carrier_hz * range_m / 299792458.0 - 3.4e-7 * (own.carrier_hz - 915e6)
-    phase += np.pi * (np.random.default_rng(0).random(600) < 0.1)
-    own = dataclasses.replace(own, phase_rad=phase % (2 * np.pi), pi_flips=True)
+    flips = np.pi * (np.random.default_rng(0).random(600) < 0.1)
+    own = dataclasses.replace(own, phase_rad=(_affine_phases(own) + flips) % (2 * np.pi), pi_flips=True)
     recording = faultless().with_reads(own)
     found = find_antenna(recording, path(recording.frame_time_s()), affine(reach_m=0.75), source="truth")
     np.testing.assert_allclose(found.position_m, ANTENNA_M, atol=0.003)
@@ -204,9 +208,20 @@ def test_one_affine_offset_gives_the_position_exactly_without_noise() -> None:
     assert max(found.std_m) < 0.01
 
 
-def test_offsets_that_differ_in_each_dwell_are_refused_where_one_is_asked_for() -> None:
-    with pytest.raises(RecordingError, match=r"the phases agree by 0\.[0-4]. .* set offsets=dwell"):
-        find_antenna(*recorded(reads(noise_rad=0.1)), affine(reach_m=0.75), source="truth")
+def test_incoherent_phases_are_refused_before_the_long_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Offsets that differ in each dwell, where one for all is asked for; the recording is named."""
+    monkeypatch.setattr(antenna_position, "find_position", None)  # a call would be an error of another type
+    recording, path_m = recorded(reads(noise_rad=0.1))
+    with pytest.raises(RecordingError, match=rf"^{recording.name}: the phases agree by 0\.[0-4]. .* set offsets=dwell"):
+        find_antenna(recording, path_m, affine(reach_m=0.75), source="truth")
+
+
+def test_phases_that_no_fit_explains_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(antenna_position, "find_position", lambda reads, peaks: None)
+    recording, path_m = recorded(reads())
+    one = recording.with_reads(dataclasses.replace(recording.reads, phase_rad=_affine_phases(recording.reads)))
+    with pytest.raises(RecordingError, match=rf"^{recording.name}: no fit of the antenna's position .* offsets=dwell"):
+        find_antenna(one, path_m, affine(reach_m=0.75), source="truth")
 
 
 @pytest.mark.ci
@@ -216,7 +231,7 @@ def test_among_reflections_the_position_is_right_to_centimetres(room: str, seed:
     """20 s in simulated rooms: 1 to 6 cm, and within the stated uncertainty; one offset for all reads, correlated reflections."""
     pytest.importorskip("mujoco")
     own, place_m, antenna_m = _moved_about(room, seed)
-    best = antenna_position._affine(own, own.time_ns * 1e-9, place_m, affine())
+    best = antenna_position._affine(own, own.time_ns * 1e-9, place_m, affine(), name=room)
     error_m, std_m = _error(f"{room} {seed}", best, antenna_m)
     assert np.linalg.norm(error_m) < 0.06
     assert (

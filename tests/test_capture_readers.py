@@ -393,6 +393,8 @@ def test_lines_come_out_of_pieces_whole_and_endless_ones_are_dropped() -> None:
 def test_addresses_and_certificates_are_checked() -> None:
     with pytest.raises(ReaderError, match="https://<host>"):
         R700Reader("192.168.1.10")
+    with pytest.raises(ReaderError, match=r"found a user or password in it; .* TAGJAX_READER_USER"):
+        R700Reader("https://root:secret@192.168.1.10")
     with pytest.raises(ReaderError, match="PEM"):
         TlsSettings(certificate="/nowhere.pem").context()
     assert TlsSettings().context().check_hostname

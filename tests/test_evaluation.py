@@ -269,6 +269,8 @@ def test_report_is_complete(tmp_path: Path) -> None:
     assert first["frame"] == "0"
     assert int(first["num_tags"]) >= 1
     assert score_table(summary).row_count == 2
+    assert score_table(summary).caption is None
+    assert "no scores" in str(score_table({"untrained": {"all": {"num_frames": 0}}}).caption)
 
 
 def test_the_reason_why_a_tag_is_not_detected_is_reported_and_shown(tmp_path: Path) -> None:

@@ -191,6 +191,7 @@ def test_sensors_are_traced_and_recorded(tmp_path: Path) -> None:
         ({"recording": "r", "camera": "playback", "reader": "llrp"}, "emulate=true"),
         ({"recording": "r", "reads_wait_s": 2.0}, "0 to 1 s"),
         ({"recording": "r", "camera": "webcam", "reader": "llrp"}, "webcam"),
+        ({"recording": "r", "address": "https://root:a@b"}, "found a user or password"),
     ],
 )
 def test_settings_that_do_not_fit_together_are_refused(values: dict[str, Any], words: str) -> None:

@@ -110,11 +110,27 @@ def test_a_camera_that_cannot_be_opened_leaves_no_folder(played: Path, tmp_path:
         ),
         ({"out": "a", "recording": "r", "emulator": {"jitter_s": -1.0}}, "0 to 10 s"),
         ({"out": "a", "recording": "r", "camera": "webcam"}, "webcam"),
+        ({"out": "a", "recording": "r", "reader": "r700", "address": "https://root:a@b"}, "found a user or password"),
     ],
 )  # fmt: skip
 def test_settings_that_do_not_fit_together_are_refused(values: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         config(**values)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("command", ["record", "stream"])
+def test_no_file_keeps_a_password_of_an_address(played: Path, tmp_path: Path, command: str) -> None:
+    words = ["camera=playback", "reader=r700", "address=https://root:hidden@127.0.0.1:9", f"recording={played}"]
+    words += [f"hydra.run.dir={tmp_path / 'run'}", *([f"out={tmp_path / 'a.zarr'}"] if command == "record" else [])]
+    ended = subprocess.run(
+        [sys.executable, "-m", f"experiments.{command}", *words], capture_output=True, text=True, cwd=ROOT, timeout=120
+    )
+    assert ended.returncode != 0
+    assert "TAGJAX_READER_PASSWORD" in ended.stdout + ended.stderr
+    assert "hidden" not in ended.stdout + ended.stderr
+    for path in tmp_path.rglob("*"):
+        assert path.is_dir() or b"hidden" not in path.read_bytes(), path
 
 
 def test_the_yaml_repeats_the_defaults_of_the_library() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..core.progress import OnProgress, unobserved
 from ..core.settings import ConfigError
-from ..radio.affine_position import find_position
+from ..radio.affine_position import coherent_places, find_position
 from ..radio.antenna_position import AntennaPosition, PathReads, fit_position, position_coherence
 from ..radio.noise import thermal_sigma_rad
 from ..recording import Recording, RecordingError, TagReads
@@ -127,8 +127,8 @@ def find_antenna(recording: Recording, path_m: np.ndarray, config: AntennaConfig
             f"{recording.name}: {used.sum()} reads of {config.epc} through antenna {config.antenna} at times at which its path "
             f"is known; expected at least {MIN_READS}. Move the tag about in view for ten seconds or more."
         )
-    find = _affine if config.offsets == "affine" else _by_groups
-    found = find(reads[used], time_s[used], place_m[used], config)
+    own = reads[used], time_s[used], place_m[used], config
+    found = _affine(*own, name=recording.name) if config.offsets == "affine" else _by_groups(*own)
     std_m = np.sqrt(np.diagonal(found.covariance_m2))
     if not np.all(std_m <= config.max_std_m):
         extent = _text(_three(np.ptp(place_m[used], axis=0)))
@@ -160,16 +160,21 @@ class _Place:
     rival_m: np.ndarray | None
 
 
-def _affine(reads: TagReads, time_s: np.ndarray, place_m: np.ndarray, config: AntennaConfig) -> _Place:
-    """The place by all reads together. Raises `RecordingError` where they agree with none."""
+def _affine(reads: TagReads, time_s: np.ndarray, place_m: np.ndarray, config: AntennaConfig, *, name: str) -> _Place:
+    """The place by all reads together. Raises `RecordingError`, before the long fits, where they agree with none."""
     own = path_reads(reads, time_s, place_m, offsets="channel", spread_rad=_READ_SPREAD_RAD)
-    found = find_position(own, _grid(config))
-    if found is None or found.coherence < _MIN_COHERENCE:
-        agree = "nothing" if found is None else f"{found.coherence:.2f}"
+    peaks = coherent_places(own, _grid(config))
+    if peaks[0].coherence < _MIN_COHERENCE:
         raise RecordingError(
-            f"the phases agree by {agree} with the best place of the antenna; expected {_MIN_COHERENCE:g} of 1. The path is wrong, much "
-            "of it is hidden from the antenna, or the reader's offsets differ in each dwell: move the tag nearer, in the open, or "
-            "set offsets=dwell."
+            f"{name}: the phases agree by {peaks[0].coherence:.2f} with the best place of the antenna; expected {_MIN_COHERENCE:g} of "
+            "1. The path is wrong, much of it is hidden from the antenna, or the reader's offsets differ in each dwell: move the tag "
+            "nearer, in the open, or set offsets=dwell."
+        )
+    found = find_position(own, peaks)
+    if found is None:
+        raise RecordingError(
+            f"{name}: no fit of the antenna's position and of what reflections add has succeeded. Move the tag farther, along all "
+            "three axes, or set offsets=dwell."
         )
     return _Place(found.best.position_m, found.covariance_m2, found.best.noise_rad, found.rival_m)
 

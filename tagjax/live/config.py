@@ -43,6 +43,7 @@ class StreamConfig(SensorSettings):
     page: PageSettings = dataclasses.field(default_factory=PageSettings)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.camera is None) != (self.reader is None):
             raise ConfigError(
                 f"camera is {self.camera}, reader is {self.reader}; expected both, or neither and recording=<a recording>."

@@ -20,7 +20,7 @@ import numpy as np
 import scipy  # `scipy.linalg` is imported at its first use
 
 from ..core.numerics import SPEED_OF_LIGHT_M_S
-from .antenna_position import PathReads
+from .antenna_position import SLOPE_UNIT_RAD_HZ, PathReads
 
 MAX_READS = 1500
 """Of more reads, so many are used, evenly spread: time grows with their number's cube."""
@@ -52,6 +52,15 @@ class Reflections:
 
 
 @dataclasses.dataclass(frozen=True)
+class CoherentPlace:
+    """A place of the antenna at which all reads are more coherent than around it."""
+
+    position_m: np.ndarray  # (3,)
+    slope_rad_hz: float
+    coherence: float  # 0 to 1
+
+
+@dataclasses.dataclass(frozen=True)
 class AffineFit:
     """A fitted position, camera frame, metres."""
 
@@ -70,7 +79,6 @@ class AffinePosition:
     best: AffineFit
     covariance_m2: np.ndarray  # (3, 3) about the best one, of all places
     rival_m: np.ndarray | None  # the most likely place far from the best one, where it has some probability
-    coherence: float  # of all reads at the most coherent place
 
 
 class AffineReads:
@@ -109,8 +117,8 @@ def coherences(reads: AffineReads, positions_m: np.ndarray) -> tuple[np.ndarray,
     return every.max(axis=1), slopes[every.argmax(axis=1)]
 
 
-def climb(reads: AffineReads, start_m: np.ndarray, step_m: float) -> tuple[np.ndarray, float, float]:
-    """The most coherent place near a start, its slope and its coherence."""
+def climb(reads: AffineReads, start_m: np.ndarray, step_m: float) -> CoherentPlace:
+    """The most coherent place near a start."""
     place = np.asarray(start_m, np.float64)
     around = np.stack(np.meshgrid(*3 * [np.arange(-2, 3)], indexing="ij"), axis=-1).reshape(-1, 3)
     value, slope = 0.0, 0.0
@@ -120,7 +128,7 @@ def climb(reads: AffineReads, start_m: np.ndarray, step_m: float) -> tuple[np.nd
         best = int(np.argmax(every))
         place, value, slope = near[best], float(every[best]), float(slopes[best])
         step_m *= _SHRINK
-    return place, slope, value
+    return CoherentPlace(place, slope, value)
 
 
 def fit_affine(
@@ -136,7 +144,9 @@ def fit_affine(
     for step in range(_NUM_STEPS):
         error = predicted + _wrapped(reads, reads.left_rad(place, slope) - level - predicted)
         away = (place - reads.position_m) / np.linalg.norm(place - reads.position_m, axis=1, keepdims=True)
-        jacobian = np.column_stack([reads.wavenumber[:, None] * away, np.ones(number), 1e-7 * reads.centred_hz])
+        jacobian = np.column_stack(
+            [reads.wavenumber[:, None] * away, np.ones(number), SLOPE_UNIT_RAD_HZ * reads.centred_hz]
+        )
         matrix = common.copy()
         matrix[np.diag_indices(number)] += sigma**2 / weight
         try:
@@ -152,7 +162,7 @@ def fit_affine(
         surprise = (precision @ rest) * own_std**2
         if step < _NUM_STEPS - 1:  # the last step only evaluates
             place = place + np.clip(change[:3], -_STEP_M, _STEP_M)
-            level, slope = level + change[3], slope + 1e-7 * change[4]
+            level, slope = level + change[3], slope + SLOPE_UNIT_RAD_HZ * change[4]
             surprise = _wrapped(reads, surprise)
             predicted = rest - surprise
             weight = 1 / (1 + np.square(surprise / (_KNEE * own_std)))
@@ -183,20 +193,25 @@ def likely_reflections(
     return best
 
 
-def find_position(reads: PathReads, places_m: np.ndarray) -> AffinePosition | None:
-    """The position from (candidates, 3) places no farther apart than half a wavelength or so; None where no fit succeeds."""
+def coherent_places(reads: PathReads, places_m: np.ndarray) -> list[CoherentPlace]:
+    """The most coherent ones first, from (candidates, 3) places no farther apart than half a wavelength or so."""
     own = AffineReads(reads)
     found, _ = coherences(own, places_m)
     step_m = float(np.max(np.abs(places_m[1] - places_m[0])))
-    peaks: list[tuple[np.ndarray, float, float]] = []
+    peaks: list[CoherentPlace] = []
     for start in places_m[np.argsort(-found)[:_NUM_STARTS]]:
         peak = climb(own, start, step_m)
-        if all(np.linalg.norm(peak[0] - other[0]) > _SAME_M for other in peaks):
+        if all(np.linalg.norm(peak.position_m - other.position_m) > _SAME_M for other in peaks):
             peaks.append(peak)
-    peaks = sorted(peaks, key=lambda one: -one[2])[:_NUM_PEAKS]
+    return sorted(peaks, key=lambda one: -one.coherence)[:_NUM_PEAKS]
+
+
+def find_position(reads: PathReads, peaks: Sequence[CoherentPlace]) -> AffinePosition | None:
+    """The position from the reads' `coherent_places`, by fits that take far longer; None where none succeeds."""
+    own = AffineReads(reads)
     # Which peak it is, by fewer reads: each peak with the constants that suit it.
     few = AffineReads(reads, _FEW_READS)
-    tried = [likely_reflections(few, place, slope) for place, slope, _ in peaks]
+    tried = [likely_reflections(few, peak.position_m, peak.slope_rad_hz) for peak in peaks]
     every = sorted((one for one in tried if one is not None), key=lambda one: -one.log_likelihood)
     if not every:
         return None
@@ -216,7 +231,7 @@ def find_position(reads: PathReads, places_m: np.ndarray) -> AffinePosition | No
         if np.linalg.norm(apart) > _RIVAL_M and share > _RIVAL
     ]
     rival = max(far, key=lambda one: one[0])[1].position_m if far else None
-    return AffinePosition(top, np.einsum("k,kij->ij", weight, np.array(spread)), rival, peaks[0][2])
+    return AffinePosition(top, np.einsum("k,kij->ij", weight, np.array(spread)), rival)
 
 
 _GRID: dict[str, Sequence[float]] = {

@@ -162,7 +162,9 @@ def score_table(summary: Mapping[str, Any], *, title: str = "") -> Table:
     if any(scores["all"].get("p_fa") is not None for scores in summary.values()):
         columns["p_fa"] = "P_FA"
     rows = [[_cell(scores["all"].get(name)) for name in columns] for scores in summary.values()]
-    table = Table(title=title, box=SIMPLE, pad_edge=False, collapse_padding=True)
+    scored = any(scores["all"].get("num_frames") != 0 for scores in summary.values())
+    caption = None if scored else "no frame has a truth to compare with: no scores"
+    table = Table(title=title, caption=caption, box=SIMPLE, pad_edge=False, collapse_padding=True)
     table.add_column("tracer", no_wrap=True)
     for heading, *cells in zip(columns.values(), *rows, strict=True):
         table.add_column(heading, justify="right", no_wrap=True, min_width=max(map(len, (heading, *cells))))

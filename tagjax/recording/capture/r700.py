@@ -28,6 +28,9 @@ from .reads import HOST_CLOCK, CapturedRead, Item, ReaderError, ReaderEvent, Rea
 if TYPE_CHECKING:
     import aiohttp
 
+USER, PASSWORD = "TAGJAX_READER_USER", "TAGJAX_READER_PASSWORD"
+"""Environment variables; no file holds what is in them."""
+
 _API = "/api/v1"
 _MAX_LINE_BYTES = 1 << 20
 _SEARCH = {"dual_target": "dual-target", "single_target": "single-target"}
@@ -79,6 +82,11 @@ class R700Reader(AbstractReader):
         tls: TlsSettings | None = None,
     ):
         super().__init__(connection or ConnectionSettings())
+        if "@" in address:
+            raise ReaderError(
+                f"address: found a user or password in it; expected them in the environment variables {USER} and {PASSWORD}, because "
+                "recordings keep the address."
+            )
         if not address.startswith(("http://", "https://")):
             raise ReaderError(f"address is {address!r}; expected https://<host> or http://<host>.")
         self._aiohttp = import_aiohttp()
@@ -244,7 +252,7 @@ def inventory_body(wanted: InventorySettings) -> dict[str, Any]:
 
 def _headers() -> dict[str, str]:
     """Basic authentication by user and password of the environment; none where they are not there."""
-    user, password = os.environ.get("TAGJAX_READER_USER"), os.environ.get("TAGJAX_READER_PASSWORD")
+    user, password = os.environ.get(USER), os.environ.get(PASSWORD)
     if user is None or password is None:
         return {}
     return {"Authorization": f"Basic {base64.b64encode(f'{user}:{password}'.encode()).decode()}"}
@@ -255,7 +263,7 @@ def _refuse(answer: Any, name: str, text: str = "") -> None:
     if answer.status in (401, 403):
         raise ReaderError(
             f"{name} refuses access (HTTP {answer.status}); expected its user and password in the environment variables "
-            "TAGJAX_READER_USER and TAGJAX_READER_PASSWORD. Set them."
+            f"{USER} and {PASSWORD}. Set them."
         )
     if 400 <= answer.status < 500:
         raise ReaderError(

@@ -15,7 +15,7 @@ from .camera import AbstractCamera, CameraSettings, PlaybackCamera
 from .emulation import LOOPBACK, AbstractEmulator, EmulatorSettings, PlaybackStart
 from .llrp import LLRP_PORT, LlrpReader
 from .playback_reader import PlaybackReader
-from .r700 import R700Reader, TlsSettings
+from .r700 import PASSWORD, USER, R700Reader, TlsSettings
 from .reader import AbstractReader, ConnectionSettings, InventorySettings
 
 CameraKind: TypeAlias = Literal["playback", "realsense", "orbbec", "k4a"]
@@ -36,6 +36,13 @@ class SensorSettings:
     tls: TlsSettings = dataclasses.field(default_factory=TlsSettings)
     emulator: EmulatorSettings = dataclasses.field(default_factory=EmulatorSettings)
 
+    def __post_init__(self) -> None:
+        if self.address is not None and "@" in self.address:
+            raise ConfigError(
+                "address: found a user or password in it; expected none, because run folder and recording keep the address. Set the "
+                f"environment variables {USER} and {PASSWORD}."
+            )
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SensorConfig(SensorSettings):
@@ -45,6 +52,7 @@ class SensorConfig(SensorSettings):
     reader: ReaderKind = "playback"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if ("playback" in (self.camera, self.reader) or self.emulate) and self.recording is None:
             raise ConfigError("recording is null; expected the recording that is played. Give recording=<a recording>.")
         if self.reader != "playback" and (self.address is None) != self.emulate:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -96,16 +97,22 @@ class WritingThread:
                         early.append(item)
                     else:
                         self._write(self.writer, item)
-                if self.writer is not None and (closing or time.monotonic() >= due):
-                    self.writer.commit()
-                    self._show()
-                    due = time.monotonic() + self._commit_s
+                    due = self._committed(due)  # also while many wait
+                due = self._committed(-math.inf if closing else due)
                 if closing:
                     if self.writer is not None:
                         self.writer.close()
                     return
         except Exception as error:
             self.error = error
+
+    def _committed(self, due: float) -> float:
+        """Commit what was written if it is due, which nothing is before the camera is open; when the next commit is due."""
+        if self.writer is None or (now := time.monotonic()) < due:
+            return due
+        self.writer.commit()
+        self._show()
+        return now + self._commit_s
 
     def _take(self, due: float) -> tuple[list[Any], bool]:
         """What waits, at the latest when a commit is due; and whether nothing more will come."""

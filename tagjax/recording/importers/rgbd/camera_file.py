@@ -99,6 +99,18 @@ def find_camera_file(folder: Path, *more: str) -> Path | None:
     return found[0] if found else None
 
 
+def required_camera_file(folder: Path, *more: str) -> Path:
+    """As `find_camera_file`. Raises `RecordingError`, which shows what a camera file holds, where there is none."""
+    found = find_camera_file(folder, *more)
+    if found is None:
+        names = [*(more[:1] or NAMES[1:2]), NAMES[0]]
+        raise RecordingError(
+            f"{folder}: no camera file; expected {' or '.join(names)} there, or camera=<file>. It holds, for example: {EXAMPLE}. "
+            "docs/importing.md has all keys."
+        )
+    return found
+
+
 def read_camera_file(path: Path) -> CameraFile:
     """A camera file, validated. Raises `RecordingError` for a file that cannot be read, unknown keys and wrong values."""
     try:

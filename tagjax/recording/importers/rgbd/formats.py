@@ -11,7 +11,7 @@ from .azure_kinect import open_azure_kinect
 from .bag_reader import BAG_ENDINGS
 from .bags import Topics, open_bag
 from .camera_file import find_camera_file
-from .picture_folder import open_picture_folder
+from .picture_folder import has_picture_folders, open_picture_folder
 from .source import RgbdSource
 from .video_file import ENDINGS, open_video
 
@@ -58,7 +58,7 @@ def _folder_format(path: Path, camera: str | None) -> str | None:
         return "bag"
     if (path / "rgb.txt").is_file() and camera is None:
         return "tum"
-    if camera is not None or find_camera_file(path) is not None:
+    if camera is not None or find_camera_file(path) is not None or has_picture_folders(path):
         return "pictures"
     return "jpg_mat" if any(path.glob("*.jpg")) else None
 

@@ -14,7 +14,7 @@ import numpy as np
 from ....core.errors import RecordingError
 from ....core.names import valid_name
 from ...image_files import read_colour, read_image
-from .camera_file import CameraFile, find_camera_file, read_camera_file
+from .camera_file import CameraFile, read_camera_file, required_camera_file
 from .source import Picture, RgbdSource
 from .times import start_time_ns, subfolder, timed_files
 
@@ -28,9 +28,7 @@ def open_picture_folder(path: Path, camera_file: Path | None = None) -> RgbdSour
     Depth is 16-bit PNG or TIFF, float32 TIFF (metres) or .npy. Raises `RecordingError` for a missing camera file, folders
     or times that cannot be used, and names that lead out of the folder; for damaged pictures when they are decoded.
     """
-    found = camera_file or find_camera_file(path)
-    if found is None:
-        raise RecordingError(f"{path}: no camera file; expected camera.json or camera.yaml there, or camera=<file>.")
+    found = camera_file or required_camera_file(path)
     camera = read_camera_file(found)
     colour = timed_files(stream_folder(path, camera.colour_folder, _COLOUR_FOLDERS, "colour_folder"), path, camera)
     depth = timed_files(depth_folder(path, camera), path, camera)
@@ -46,6 +44,11 @@ def open_picture_folder(path: Path, camera_file: Path | None = None) -> RgbdSour
         max_gap_s=camera.max_gap_s,
         start_ns=start_time_ns(camera.start),
     )
+
+
+def has_picture_folders(path: Path) -> bool:
+    """Whether a folder holds colour and depth in folders of the usual names."""
+    return all(any((path / name).is_dir() for name in names) for names in (_COLOUR_FOLDERS, _DEPTH_FOLDERS))
 
 
 def depth_folder(base: Path, camera: CameraFile, *more: str) -> Path:

@@ -8,11 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ....core.errors import RecordingError
 from ....core.names import valid_name
 from ...checks import FIRST_DATE_NS
 from ...video_files import check_whole, frame_time_ns, num_stated_frames, opened_video
-from .camera_file import find_camera_file, read_camera_file
+from .camera_file import read_camera_file, required_camera_file
 from .picture_folder import by_time, depth_folder, files_as_pictures
 from .source import Picture, RgbdSource
 from .times import check_counts, picture_files, start_time_ns, timed_files
@@ -28,11 +27,8 @@ def open_video(path: Path, camera_file: Path | None = None, start: str | float |
     or, where they begin within a day of 0, since the first frame. Raises `RecordingError` for files that are missing or cannot be
     used, and, while it is read, for a video that is cut short.
     """
-    found = camera_file or find_camera_file(path.parent, *(f"{path.stem}{end}" for end in (".json", ".yaml", ".yml")))
-    if found is None:
-        raise RecordingError(
-            f"{path}: no camera file; expected {path.stem}.json or camera.json beside it, or camera=<file>."
-        )
+    own = (f"{path.stem}{end}" for end in (".json", ".yaml", ".yml"))
+    found = camera_file or required_camera_file(path.parent, *own)
     camera = read_camera_file(found)
     folder = depth_folder(path.parent, camera, f"{path.stem}_depth")
     start_ns = start_time_ns(camera.start if start is None else start)
