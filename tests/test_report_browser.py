@@ -59,6 +59,9 @@ def test_the_page_fits_and_reports_no_error(
         assert page.locator(f"#{name} h2").is_visible()
     for name in (".timeline .bar", ".chart", ".slider input", ".cards img", ".stages img", "video", "pre"):
         assert page.locator(name).first.is_visible(), name
+    scores = page.locator("#table thead th", has_text="box IoU").bounding_box()
+    assert scores is not None
+    assert scores["x"] + scores["width"] <= width, "the scores are seen without scrolling sideways"
     paper, ink = (page.evaluate(f"getComputedStyle(document.body).{name}") for name in ("backgroundColor", "color"))
     assert _brightness(paper) > 200 > 100 > _brightness(ink) if scheme == "light" else _brightness(paper) < 50 < 150 < _brightness(ink)  # fmt: skip
     page.screenshot(path=tmp_path / "page.png", full_page=True)

@@ -100,7 +100,10 @@ def test_soft_masks_are_shown_as_log_odds_and_beside_binary_ones_the_attention(t
     def stages(soft_masks: np.ndarray | None) -> list[str]:
         shown = dataclasses.replace(picture, soft_masks=soft_masks)
         write_stages(tmp_path, scene, shown, clip.camera, clip.frames)
-        return [one["title"] for one in json.loads((tmp_path / STAGES).read_text())["stages"]]
+        written = json.loads((tmp_path / STAGES).read_text())["stages"]
+        explained = [one["text"] for one in written if "nats" in one["text"]]
+        assert len(explained) == (1 if soft_masks is picture.soft_masks else 0), "the first picture explains all"
+        return [one["title"] for one in written]
 
     names = [short_name(epc) for epc in picture.epcs]
     shared = ["colour", "depth", "optical flow", "change of distance to the antenna"]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from test_segment_tracer import EPCS, scene
 
+from experiments.view import with_run
 from tagjax.core.settings import ConfigError
 from tagjax.evaluation.view import ViewConfig, view_recording
 from tagjax.recording.store import save_recording
@@ -160,6 +161,24 @@ def test_a_band_grows_with_the_way_and_is_forgotten() -> None:
     np.testing.assert_allclose(error.after(0.1, frame(-0.25)), [0.01, 0.0])  # sqrt(1e-4 * 2^2 * 0.25)
     np.testing.assert_allclose(error.after(4.1, frame(0.0)), [0.01 * np.exp(-0.5), 0.0], rtol=1e-6)
     np.testing.assert_allclose(error.after(4.1, frame(np.nan)), [0.01 * np.exp(-0.5), 0.0], rtol=1e-6)
+
+
+def test_a_run_gives_its_tracer_and_its_weights(tmp_path: Path) -> None:
+    values = {"recording": "a.zarr", "tracer": {"_target_": "other"}, "weights": None, "run": None}
+    assert with_run(values) == {"recording": "a.zarr", "tracer": {"_target_": "other"}, "weights": None}
+    values["run"] = str(tmp_path)
+    with pytest.raises(FileNotFoundError, match="expected a run folder of experiments"):
+        with_run(values)
+    (tmp_path / "config.yaml").write_text(f"tracer:\n  _target_: {TRACER['_target_']}\n")
+    found = with_run(values)
+    assert found == {
+        "recording": "a.zarr",
+        "tracer": {"_target_": TRACER["_target_"]},
+        "weights": str(tmp_path / "weights.json"),
+    }
+    assert ViewConfig(**found).weights == found["weights"]
+    with pytest.raises(ValueError, match=r"found both run=.* and weights=default"):
+        with_run(values | {"weights": "default"})
 
 
 def test_a_missing_package_is_reported_before_the_work(

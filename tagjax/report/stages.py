@@ -87,7 +87,8 @@ def write_stages(folder: Path, recording: Recording, picture: Picture, camera: C
     for tag, epc in list(enumerate(picture.epcs))[:_MAX_TAGS]:
         if soft is not None and is_soft:
             title = f"log odds of {short_name(epc)}"
-            text = f"that a pixel is of the tag's object: orange for it, blue against it, by {MOST_NATS} nats or more; grey: not followed"
+            meaning = f"that a pixel is of the tag's object: orange for it, blue against it, by {MOST_NATS} nats or more; grey: not followed"
+            text = "likewise" if tag else meaning
             shown.append((title, text, change_colours(log_odds(soft[tag]), float(MOST_NATS))))
             continue
         rd_m, std_m = np.asarray(frames.radio.relative_m[-1, tag, 0]), np.asarray(frames.radio.std_m[-1, tag, 0])

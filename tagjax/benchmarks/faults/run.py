@@ -6,7 +6,7 @@ import dataclasses
 import json
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,24 +97,31 @@ def num_failed(results: Mapping[str, Any]) -> int:
 
 
 def rendered(results: Mapping[str, Any]) -> str:
-    """The results as a Markdown table with a sum, the first failures, and the command of each kind."""
+    """The results as a Markdown table, a row for each kind and its sum, and the first failures by their variety."""
     if not results["kinds"]:
         return "*The trial has not been run yet: `python -m experiments.fault_trial`.*"
+    rows = [
+        (f"`{name}`", *_counts(kind["outcomes"]), f"`number={kind['number']} seed={kind['seed']}`{_made_at(kind)}")
+        for name, kind in results["kinds"].items()
+    ]
     outcomes = [one for kind in results["kinds"].values() for one in kind["outcomes"]]
-    rows = [(one["kind"], f"{one['tried']:,}", f"{one['failed']:,}") for one in outcomes]
-    rows.append(("all", f"{sum(one['tried'] for one in outcomes):,}", f"{num_failed(results):,}"))
+    rows.append(("all", *_counts(outcomes), ""))
     failures = [f"- {one['kind']}: {example}" for one in outcomes for example in one["examples"]]
-    commands = [_made_by(name, kind) for name, kind in results["kinds"].items()]
     parts = [
-        markdown_table(("kind", "tried", "failed"), rows),
+        markdown_table(("kind", "varieties", "tried", "failed", "made with"), rows),
         *(["The first failures:\n\n" + "\n".join(failures)] if failures else []),
     ]
-    return "\n\n".join([*parts, "Made by:\n\n" + "\n".join(commands)])
+    return "\n\n".join(parts)
 
 
-def _made_by(name: str, kind: Mapping[str, Any]) -> str:
-    command = f"`python -m experiments.fault_trial 'kinds=[{name}]' number={kind['number']} seed={kind['seed']}`"
+def _counts(outcomes: Sequence[Mapping[str, Any]]) -> tuple[str, str, str]:
+    """The numbers of varieties, of faults that were tried, and of those that failed."""
+    tried, failed = (sum(one[name] for one in outcomes) for name in ("tried", "failed"))
+    return str(len(outcomes)), f"{tried:,}", f"{failed:,}"
+
+
+def _made_at(kind: Mapping[str, Any]) -> str:
     stopped = "" if kind["done"] == kind["number"] else f", stopped after {kind['done']}"
     commit = kind.get("commit")
     at = f", revision `{commit[:10]}`" if commit else ""
-    return f"- {command}{stopped}{at}{', ' + kind['date_utc'][:10] if 'date_utc' in kind else ''}"
+    return f"{stopped}{at}{', ' + kind['date_utc'][:10] if 'date_utc' in kind else ''}"

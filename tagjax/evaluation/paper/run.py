@@ -16,6 +16,8 @@ from .sources import MissingRecordingsError, Sources, described
 from .table import FIGURES, PaperFigure, chosen
 
 PAGE, LIST = "figures.md", "figures.json"
+CURVES = "Curves are over frames since the first motion; bands are 95 % intervals of the mean, by recording (none with a single recording)."
+"""What holds for all figures with curves; the page begins with it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +93,7 @@ def file_name(name: str) -> str:
 
 def page(drawn: list[Drawn]) -> str:
     """A page in Markdown with every figure, its caption, what is seen and what the paper reports."""
-    parts = []
+    parts = [f"{CURVES}\n\n"]
     for one in drawn:
         figure = FIGURES[one.name]
         parts.append(f"## {one.title}\n\n")
@@ -99,7 +101,8 @@ def page(drawn: list[Drawn]) -> str:
             parts.append(f"{one.seen}\n\n")
             continue
         parts.append(f"![{one.title}]({one.picture})\n\n{figure.caption}\n\n")
-        parts += [f"Recordings: {one.recordings}. "] if one.recordings else []
-        parts.append(f"Numbers: [{one.numbers}]({one.numbers}).\n\n")
+        parts.append(
+            f"{one.recordings}; [numbers]({one.numbers}).\n\n" if one.recordings else f"[Numbers]({one.numbers}).\n\n"
+        )
         parts.append(f"- Here: {one.seen}\n- The paper: {figure.reported}\n\n")
     return "".join(parts).rstrip("\n") + "\n"

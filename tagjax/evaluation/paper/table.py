@@ -45,8 +45,6 @@ TAGATTENTION, TAGVIEW, TAGVISION = "TagAttention", "Tagview", "TagVision"
 
 _BOX = (Recordings("single_static", ("box",), one=True),)
 
-_BAND = "Frames since the first motion; band: 95 % interval of the mean, by recording (none with a single recording)."
-
 _CEILING = tuple(Recordings(f"ceiling_{number}") for number in range(2, 7))
 
 FIGURES: dict[str, PaperFigure] = {
@@ -86,8 +84,8 @@ FIGURES: dict[str, PaperFigure] = {
     ),
     "10": PaperFigure(
         TAGATTENTION, 10, (Recordings("single_static"),), curves.all_and_each,
-        "One object in a meeting room, five objects: box IoU (0 without a detection) and centre error (over detections). " + _BAND[:-1]
-        + ", and none at the right.",
+        "One object in a meeting room, five objects: box IoU (0 without a detection) and centre error (over detections). Right: by object, "
+        "without bands.",
         "IoU close to 0 in the first frames, rising until about frame 40 and then high; the centre error falls likewise.",
     ),
     "11": PaperFigure(
@@ -97,7 +95,7 @@ FIGURES: dict[str, PaperFigure] = {
     ),
     "12": PaperFigure(
         TAGATTENTION, 12, (Recordings("single_static"), Recordings("single_dynamic")), curves.by_suite,
-        "One object in the meeting room, and in a crowded office in which another person walks. " + _BAND,
+        "One object in the meeting room, and in a crowded office in which another person walks.",
         "Both scenarios are equivalent.",
     ),
     "13": PaperFigure(
@@ -112,7 +110,7 @@ FIGURES: dict[str, PaperFigure] = {
     ),
     "14": PaperFigure(
         TAGATTENTION, 14, (Recordings("multi_2"),), curves.one_panel,
-        "Two objects, one in each hand. " + _BAND,
+        "Two objects, one in each hand.",
         "As with a single object; it takes less than 35 frames to find each object, which is then kept.",
     ),
     "15": PaperFigure(
@@ -125,19 +123,19 @@ FIGURES: dict[str, PaperFigure] = {
     ),
     "16": PaperFigure(
         TAGATTENTION, 16, (Recordings("speed"),), curves.by_variant,
-        "A person with a badge walks towards the sensor and away at four speeds; gaps: the picture's edge cuts the person off. " + _BAND,
+        "A person with a badge walks towards the sensor and away at four speeds; gaps: the picture's edge cuts the person off.",
         "At every speed the person is found and kept after around 25 frames, sooner at high speed.",
     ),
     "17": PaperFigure(
         TAGATTENTION, 17, (Recordings("velocity_threshold"),), curves.by_threshold,
         "An object that is stationary, then waved at a peak speed of 0.5 m/s (slow) or 2.5 m/s (fast): the published tracer at three "
-        "velocity thresholds, and the learnable one, which has no threshold. " + _BAND,
+        "velocity thresholds, and the learnable one, which has no threshold.",
         "Slow target: a smaller threshold reacts sooner, 0.5 m/s finds nothing, and 0.01 m/s is less accurate than 0.1 m/s. Fast target: "
         "all find it with a short latency.",
     ),
     "19": PaperFigure(
         TAGATTENTION, 19, (Recordings("illumination"),), curves.by_variant,
-        "The same kind of scene in bright, dim and dark light. " + _BAND,
+        "The same kind of scene in bright, dim and dark light.",
         "Robust where the target can be seen, and much worse where it can hardly be seen.",
     ),
     "20": PaperFigure(

@@ -47,7 +47,9 @@ def headline(contents: Contents) -> Html:
     about = f"{_count(len(recordings), 'recording')}, {_count(tags, 'tag')}, {_count(frames, 'frame')}"
     counted = scores["all"].get("num_frames") or 0
     if not counted:
-        text = f"Tracer {tracer}: {about}. No frame has a truth to compare with, so there are detections and no scores."
+        text = (
+            f"Tracer: {tracer}. {about}. No frame has a truth to compare with, so there are detections and no scores."
+        )
         return together(element("p", text, class_="lead"))
     figures = []
     for name, label, meaning in _MEASURES[:4]:
@@ -57,7 +59,7 @@ def headline(contents: Contents) -> Html:
             element("div", element("dt", label), element("dd", number(scores["all"].get(name)), between), title=meaning)
         )
     text = (
-        f"Tracer {tracer}: {about}. Scores are over {_count(counted, 'frame')} of tags: from a tag's first motion on, while its "
+        f"Tracer: {tracer}. {about}. Scores are over {_count(counted, 'frame')} of tags: from a tag's first motion on, while its "
         "whole object is visible."
     )
     parts = [element("p", text, class_="lead"), element("dl", *figures, class_="figures")]
@@ -211,13 +213,17 @@ def recordings_table(contents: Contents) -> Html:
     scores = contents.summary[tracer]["recordings"]
     for name in contents.recordings():
         own = scores.get(name, {})
-        rows.append([element("strong", name), element("strong", "all"), *_measured(own.get("all", {}))])
+        rows.append([element("strong", name), *_measured(own.get("all", {}))])
         rows += [
-            [name, tag.epc, *_measured(own.get("tags", {}).get(tag.epc, {}))] for tag in contents.tags[tracer][name]
+            [
+                element("span", short_name(tag.epc), title=tag.epc, class_="tag"),
+                *_measured(own.get("tags", {}).get(tag.epc, {})),
+            ]
+            for tag in contents.tags[tracer][name]
         ]
     heads = ["frames", *(label for _, label, _ in _MEASURES[:5])]
     return table(
-        ["recording", "tag", *heads],
+        ["recording, tag", *heads],
         rows,
         caption=f"Scores of {tracer}, worst recording first",
         number_columns=len(heads),
