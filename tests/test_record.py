@@ -327,6 +327,104 @@ def test_realsense_depth_units_become_millimetres(monkeypatch: pytest.MonkeyPatc
     assert stopped == [True]
 
 
+def _orbbec(devices: list[Any], started: list[Any]) -> Any:
+    """A stand-in for pyorbbecsdk: colour of 8 x 6 pixels, depth in units of 0.25 mm, and a first set without depth."""
+    names = types.SimpleNamespace
+
+    class Profile:
+        def __init__(self, *wanted: Any):
+            self.wanted = wanted
+
+        def get_intrinsic(self) -> Any:
+            return names(fx=300.0, fy=301.0, cx=4.0, cy=3.0, width=8, height=6)
+
+        def get_distortion(self) -> Any:
+            return names(k1=0.1, k2=0.2, k3=0.5, k4=0.6, k5=0.7, k6=0.8, p1=0.3, p2=0.4)
+
+    class Devices(list):
+        def get_device_by_serial_number(self, serial: str) -> Any:
+            return next(one for one in self if one.get_device_info().get_serial_number() == serial)
+
+    pixels = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
+    colour = names(
+        get_height=lambda: 6, get_width=lambda: 8, get_data=pixels.tobytes, get_timestamp_us=lambda: 1_234_567
+    )
+    raw = np.full((6, 8), 6001, np.uint16)
+    depth = names(get_height=lambda: 6, get_width=lambda: 8, get_data=raw.tobytes, get_depth_scale=lambda: 0.25)
+    sets = iter([names(get_color_frame=lambda: colour, get_depth_frame=lambda one=one: one) for one in (None, depth)])
+
+    class Pipeline:
+        def __init__(self, device: Any):
+            self.device = device
+
+        def get_stream_profile_list(self, sensor: str) -> Any:
+            return names(get_video_stream_profile=lambda *wanted: Profile(sensor, *wanted))
+
+        def enable_frame_sync(self) -> None:
+            started.append("in step")
+
+        def start(self, config: Any) -> None:
+            started.append(config)
+
+        def wait_for_frames(self, timeout_ms: int) -> Any:
+            found = next(sets)
+            return names(as_frame_set=lambda: found)
+
+        def stop(self) -> None:
+            started.append("stopped")
+
+    class Config:
+        def __init__(self) -> None:
+            self.streams: list[tuple[Any, ...]] = []
+
+        def enable_stream(self, profile: Profile) -> None:
+            self.streams.append(profile.wanted)
+
+        def set_frame_aggregate_output_mode(self, mode: str) -> None:
+            self.mode = mode
+
+    return names(
+        Context=lambda: names(query_devices=lambda: Devices(devices)),
+        Pipeline=Pipeline,
+        Config=Config,
+        AlignFilter=lambda align_to_stream: names(process=lambda frames: frames),
+        OBError=RuntimeError,
+        OBSensorType=names(COLOR_SENSOR="colour", DEPTH_SENSOR="depth"),
+        OBFormat=names(RGB="rgb", Y16="y16"),
+        OBStreamType=names(COLOR_STREAM="colour"),
+        OBFrameAggregateOutputMode=names(FULL_FRAME_REQUIRE="both"),
+    )
+
+
+def test_orbbec_depth_becomes_millimetres_and_a_set_without_depth_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for pyorbbecsdk2: the adapter is untested on hardware."""
+    devices = [
+        types.SimpleNamespace(
+            get_device_info=lambda serial=serial: types.SimpleNamespace(get_serial_number=lambda: serial)
+        )
+        for serial in ("66", "77")
+    ]
+    started: list[Any] = []
+    monkeypatch.setitem(sys.modules, "pyorbbecsdk", _orbbec(devices, started))
+    camera = OrbbecCamera(CameraSettings(width=8, height=6, serial="77"))
+    video = camera.open()
+    assert (video.intrinsics.fx_px, video.intrinsics.cy_px, video.intrinsics.width) == (300.0, 3.0, 8)
+    assert video.intrinsics.distortion == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # OpenCV's order
+    assert started[0] == "in step"
+    assert started[1].streams == [("colour", 8, 6, "rgb", 30), ("depth", 0, 0, "y16", 30)]
+    frame = next(camera.frames(lambda: False))
+    assert frame.colour[0, 1].tolist() == [3, 4, 5]
+    assert (frame.depth[0, 0], frame.depth.dtype, frame.device_time_ns) == (1500, np.uint16, 1_234_567_000)
+    with pytest.raises((StopIteration, RuntimeError)):  # both sets were used
+        next(camera.frames(lambda: False))
+    assert camera.describe() == {"name": "Orbbec", "frame_rate_hz": 30, "serial": "77"}
+    camera.close()
+    assert started[-1] == "stopped"
+    monkeypatch.setitem(sys.modules, "pyorbbecsdk", _orbbec([], started))
+    with pytest.raises(CameraError, match="no camera found"):
+        OrbbecCamera(CameraSettings()).open()
+
+
 @pytest.mark.parametrize(
     ("camera", "package", "extra"),
     [(RealSenseCamera, "pyrealsense2", "realsense"), (OrbbecCamera, "pyorbbecsdk", "orbbec"), (AzureKinectCamera, "pyk4a", "k4a")],
