@@ -162,7 +162,8 @@ def test_the_packaged_parameters_are_of_the_tracer_as_it_is() -> None:
     assert clips == ClipSettings()
     learned, untrained = tracer.physical(), TagAttention().physical()
     assert learned.keys() == untrained.keys()
-    assert sum(learned[name] != pytest.approx(untrained[name], rel=1e-3) for name in learned) > 10
+    changed = {name for name in learned if learned[name] != pytest.approx(untrained[name], rel=1e-3)}
+    assert changed == {name for name in learned if name.startswith("reader.")}  # learned from the reads alone
     assert all(np.isfinite(value) for value in learned.values())
 
 
@@ -206,7 +207,7 @@ def test_a_tracer_configuration_brings_its_clips() -> None:
     settings = _tracer_settings("tagattention")
     assert tracer_clips(settings) == ClipSettings()
     assert tracer_clips(_tracer_settings("tagattention_published")) == ClipSettings(
-        window_s=0.133, estimator="published"
+        window_s=0.133, estimator="published", antennas="busiest"
     )
     assert isinstance(make_tracer(settings), TagAttention)
     with pytest.raises(ConfigError, match=r"tracer\.clips: unknown key 'strid'"):
