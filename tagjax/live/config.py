@@ -119,5 +119,7 @@ def open_source(config: StreamConfig, stack: contextlib.ExitStack) -> Source:
 
 def _antennas(config: StreamConfig, played: Recording | None) -> tuple[int, ...]:
     if played is not None:
-        return choose_antennas(played, selected_tags(played, None), config.antennas or "all")
+        return choose_antennas(
+            played, selected_tags(played, None), "all" if config.antennas is None else config.antennas
+        )
     return config.inventory.antennas if config.antennas is None else config.antennas

@@ -61,7 +61,7 @@ class PieceFiles:
         `RecordingError` where the folder holds pieces of other recordings.
         """
         make_folder(self.folder)
-        held, asked = self._recordings(), [recording.name for recording in recordings]
+        held, asked = [one["recording"] for one in self._index()], [recording.name for recording in recordings]
         if held != asked[: len(held)]:
             raise RecordingError(
                 f"{self.folder}: found pieces of {_listed(held)}; expected those of {_listed(asked)}, in this order. Give "
@@ -77,23 +77,23 @@ class PieceFiles:
             ):
                 names.append(f"{len(index):04d}-{len(names):03d}.safetensors")
                 _write(self.folder / names[-1], piece)
-            write_json(self.folder / _INDEX, {"recordings": asked[: len(index) + 1], "pieces": [*index, names]})
+            write_json(self.folder / _INDEX, [*index, {"recording": recording.name, "files": names}])
             on_progress(stage, len(index) + 1, len(recordings))
         return self
 
     def recording_of(self, index: int) -> int:
         """The number of the recording that a piece is of."""
-        return [number for number, names in enumerate(self._index()) for _ in names][index]
+        return [number for number, one in enumerate(self._index()) for _ in one["files"]][index]
 
     def num_sure(self, settings: HindsightSettings) -> int:
         """The number of tag-frames in which the teacher is sure of a mask."""
         return sum(int(np.sum(one.frames.present & (one.frames.confidence > settings.sure))) for one in self)
 
     def __len__(self) -> int:
-        return sum(len(names) for names in self._index())
+        return len(self._files())
 
     def __getitem__(self, index: int) -> Piece:
-        return _read(self.folder / [name for names in self._index() for name in names][index])
+        return _read(self.folder / self._files()[index])
 
     def __iter__(self) -> Iterator[Piece]:
         return (self[number] for number in range(len(self)))
@@ -103,17 +103,14 @@ class PieceFiles:
         if self.folder.exists():
             remove(self.folder)
 
-    def _index(self) -> list[list[str]]:
-        """The names of each recording's files."""
-        return self._content()["pieces"]
+    def _files(self) -> list[str]:
+        """The names of all files."""
+        return [name for one in self._index() for name in one["files"]]
 
-    def _recordings(self) -> list[str]:
-        """The names of the recordings."""
-        return self._content()["recordings"]
-
-    def _content(self) -> dict[str, Any]:
+    def _index(self) -> list[dict[str, Any]]:
+        """Of each recording its name (`recording`) and the names of its `files`."""
         path = self.folder / _INDEX
-        return json.loads(path.read_text()) if path.exists() else {"recordings": [], "pieces": []}
+        return json.loads(path.read_text()) if path.exists() else []
 
 
 def _listed(names: Sequence[str]) -> str:
