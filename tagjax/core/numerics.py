@@ -30,9 +30,24 @@ def safe_norm(x: Float[Array, "*shape axis"]) -> Float[Array, "*shape"]:
 
 
 def safe_divide(numerator: Float[Array, "*shape"], denominator: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Quotient that is 0, with gradient 0, where the denominator is 0."""
+    """Quotient that is 0, with gradient 0, where the denominator is 0.
+
+    Its gradient is finite wherever the quotient's is, for weights that all but vanish as well.
+    """
     nonzero = denominator != 0
-    return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)
+    return jnp.where(nonzero, _ratio(numerator, jnp.where(nonzero, denominator, 1.0)), 0.0)
+
+
+@jax.custom_jvp
+def _ratio(numerator: Array, denominator: Array) -> Array:
+    return numerator / denominator
+
+
+@_ratio.defjvp
+def _ratio_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    """By the quotient itself: a denominator below 1e-19 has a square below the smallest float32, and the usual rule is 0/0."""
+    ratio = _ratio(*primals)
+    return ratio, (tangents[0] - ratio * tangents[1]) / primals[1]
 
 
 def entries(table: Shaped[Array, " entry"], index: Int[Array, "*shape"]) -> Shaped[Array, "*shape"]:
