@@ -6,6 +6,7 @@ python -m experiments.evaluate tracer=tagattention_published suite=single_static
 python -m experiments.evaluate tracer=tagattention tracer@baselines.published=tagattention_published 'recordings=[c.zarr]'
 python -m experiments.evaluate tracer=tagattention_rgb depth=none 'recordings=[c.zarr]'     # a colour camera, several antennas
 python -m experiments.evaluate run=<folder> 'recordings=[c.zarr]' virtual_tag.tracks=tracks.csv 'virtual_tag.seeds=[0]'
+python -m experiments.evaluate -m hparams_search=optuna_equations suite=corpus split=train  # a killed search resumes when started again
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .command import command, print_result, write_config
+from .hparams_search import sweep_score
 from .run_folder import read_configuration
 from .suites import suite_recordings
 
@@ -29,7 +31,7 @@ def run_configuration(run: str | None) -> dict[str, Any] | None:
 
 
 @command
-def main(values: dict[str, Any], folder: Path) -> float:
+def main(values: dict[str, Any], folder: Path) -> float | None:
     from rich.console import Console
 
     from tagjax.core.settings import from_mapping
@@ -53,7 +55,7 @@ def main(values: dict[str, Any], folder: Path) -> float:
     console.print(f"report: {folder / PAGE}", soft_wrap=True, highlight=False)
     print_result(summary)
     iou = next(iter(summary.values()))["all"].get("iou")
-    return float("nan") if iou is None else float(iou)
+    return None if iou is None else sweep_score(float(iou))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,19 @@
-"""For a hyper-parameter search: the number of remaining trials, and the score of a run."""
+"""For a hyper-parameter search: the number of remaining trials, the score of a run, and the report at the end.
+
+Configurations get at the first by the resolver `trials_left`, and at the last by `search_report`.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
 from pathlib import Path
+from typing import Any
 
+from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
+
+_log = logging.getLogger(__name__)
 
 
 def trials_left(
@@ -40,6 +47,27 @@ def trials_left(
     return left
 
 
+class SearchReport(Callback):
+    """Hydra's callback that writes what an Optuna search has found into the sweep's folder when it ends."""
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        del kwargs
+        sweeper, folder = config.hydra.sweeper, Path(config.hydra.sweep.dir)
+        try:
+            from tagjax.evaluation.study import write_study
+
+            written = write_study(sweeper.storage, sweeper.study_name, folder)
+        except ImportError as error:
+            _log.warning("No report of the search: %s. Install the sweep and viz extras.", error)
+            return
+        if written:
+            _log.info("table and pictures of the search: %s", folder)
+
+
+OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
+OmegaConf.register_new_resolver("search_report", lambda: f"{__name__}.{SearchReport.__name__}", replace=True)
+
+
 def _without_score(config: DictConfig) -> bool:
     training, validation = (OmegaConf.select(config, f"data.{name}") for name in ("recordings", "validation"))
     overrides = OmegaConf.select(config, "hydra.overrides.task") or ()
@@ -48,7 +76,7 @@ def _without_score(config: DictConfig) -> bool:
 
 
 def sweep_score(score: float) -> float | None:
-    """The number that a training run returns to its sweep: None for NaN, which marks the trial as failed.
+    """The number that a run returns to its sweep: None for NaN, which marks the trial as failed.
 
     NaN itself would end an Optuna sweep.
     """

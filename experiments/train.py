@@ -12,15 +12,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from .command import resumable_command
 from .errors import errors_in_one_line
-from .hparams_search import sweep_score, trials_left
+from .hparams_search import sweep_score
 from .run_folder import check_configuration, keep_configuration
 from .suites import suite_recordings
-
-OmegaConf.register_new_resolver("trials_left", trials_left, replace=True)
 
 
 @resumable_command

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from tagjax.core.build import build
-from tagjax.core.constrained import Fraction, Negative, Positive, named_values, static_settings, with_named_values
+from tagjax.core.constrained import (
+    Fraction,
+    Negative,
+    Positive,
+    learning_only,
+    named_values,
+    static_settings,
+    with_named_values,
+)
 from tagjax.core.settings import ConfigError
 
 
@@ -111,6 +119,19 @@ def test_values_have_dotted_names_and_come_back():
 def test_other_names_and_impossible_values_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         with_named_values(Outer(Inner()), values)
+
+
+def test_gradients_reach_the_named_scalars_only():
+    def total(module: Outer) -> jax.Array:
+        leaves = jax.tree.leaves(eqx.filter(learning_only(module, ["inner.s*", "part"]), eqx.is_inexact_array))
+        return sum((jnp.sum(leaf) for leaf in leaves), jnp.zeros(()))
+
+    slopes = eqx.filter_grad(total)(Outer(Inner()))
+    assert float(slopes.inner.size_m.unconstrained) == float(slopes.part.unconstrained) == 1.0
+    assert float(slopes.inner.offset) == 0.0
+    assert named_values(learning_only(Outer(Inner()), ["*"])) == named_values(Outer(Inner()))
+    with pytest.raises(ValueError, match=r"inner\.sise_m is no parameter; .*: inner\.size_m, inner\.offset, part\.$"):
+        learning_only(Outer(Inner()), ["part", "inner.sise_m"])
 
 
 def test_a_module_is_built_from_nested_settings():

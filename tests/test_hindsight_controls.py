@@ -26,7 +26,7 @@ from tagjax.training.hindsight.control import control_of, control_reads
 from tagjax.training.hindsight.objective import control_sums, hindsight_sums
 from tagjax.training.hindsight.pieces import frame_of
 
-SETTINGS = HindsightSettings(memory=1.0, learn="confidence", controls=0.25)
+SETTINGS = HindsightSettings(learn="confidence", controls=0.25)
 _sums = eqx.filter_jit(control_sums)
 
 
@@ -115,7 +115,7 @@ def test_controls_count_as_the_fraction_of_reads_that_belong_to_nothing(piece: P
     np.testing.assert_allclose(logged["false_confidence/control"], found.claimed / 80, rtol=1e-4)
     bare = dataclasses.replace(piece.frames, control=None)
     _, fewer = eqx.filter_eval_shape(SETTINGS.terms, TRACER, piece.camera, bare)
-    assert set(fewer) == {"overlap", "false_confidence"}
+    assert set(fewer) == {"overlap", "place_nats", "false_confidence"}
 
 
 def test_a_control_teaches_detection_its_true_slope_and_nothing_else(piece: Piece) -> None:
@@ -142,8 +142,7 @@ def test_detection_has_the_slope_that_the_whole_tracer_gives_it(piece: Piece) ->
 
         return jax.jit(jax.grad(wrong))(learnable)
 
-    alone = dataclasses.replace(SETTINGS, memory=0.9)
-    found = [slopes(one) for one in (dataclasses.replace(alone, learn="all"), alone)]
+    found = [slopes(one) for one in (dataclasses.replace(SETTINGS, learn="all"), SETTINGS)]
     for one, other in zip(*(jax.tree.leaves(each.detection) for each in found), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
     for each in found:
@@ -176,7 +175,7 @@ def test_files_hold_the_controls_and_are_the_same_each_time(piece: Piece, tmp_pa
     [
         (
             {"hindsight": {"learn": "body"}},
-            r"hindsight\.learn: found 'body'; expected one of 'all', 'masks', 'confidence', 'reads'",
+            r"hindsight\.learn: found 'body'; expected one of 'all', 'masks', 'place', 'confidence', 'reads'",
         ),
         ({"hindsight": {"controls": 1.0}}, r"hindsight: controls is 1\.0; expected a fraction from 0 to 1, 1 excluded"),
         (

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from composed import composed
 from synthetic_clips import BOXES, CARRIER_HZ, EPCS, offset_m, recording
 
 from tagjax.core.build import build
@@ -19,6 +20,7 @@ from tagjax.recording import Intrinsics, Recording
 from tagjax.tagattention.segments import Segmenter, SegmentTracker, TagAttention
 from tagjax.tagattention.segments.attention import AttentionEvidence
 from tagjax.tagattention.segments.detection import Detection
+from tagjax.tagattention.tracer_settings import make_tracer
 from tagjax.tracing.clips import load_clip
 from tagjax.tracing.live import LiveTracer
 from tagjax.tracing.status import Status
@@ -67,6 +69,19 @@ def test_two_objects_are_found_and_outlined(traced):
         mask = np.asarray(traced.mask[late, tag]) > 0.5
         true = np.asarray(scene().truth.labels)[late] == label
         assert np.sum(mask & true) / np.sum(mask | true) > 0.9
+
+
+def test_the_papers_equations_alone_find_both_objects(clip):
+    """`tracer=tagattention_equations`: attention in place of dwells, and no other use of the reads."""
+    settings = composed("evaluate", "tracer=tagattention_equations", "tracer.segments.segmenter.num_segments=512")
+    tracer = make_tracer(settings["tracer"])
+    assert isinstance(tracer, TagAttention)
+    assert tracer.dwell is tracer.hidden is tracer.free is None
+    found = eqx.filter_jit(trace)(tracer, clip.camera, clip.frames)
+    assert bool(jnp.all(found.detected[40:]))
+    for tag, label in enumerate(EPCS.values()):
+        x0, y0, x1, y1 = BOXES[label]
+        np.testing.assert_allclose(found.box_px[40:, tag], [[2 * x0, 2 * y0, 2 * x1 + 1, 2 * y1 + 1]] * 20, atol=1.0)
 
 
 def test_steps_and_places_are_those_of_the_objects(traced, clip):

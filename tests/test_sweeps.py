@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import importlib.util
 import json
 import os
@@ -22,7 +23,17 @@ import synthetic_clips as synthetic
 import yaml
 
 from tagjax.core.settings import ConfigError, from_mapping
-from tagjax.evaluation.sweep import Line, SweepConfig, point_name, read_lines, run_sweep, table, write_sweep
+from tagjax.evaluation.sweep import (
+    Line,
+    SweepConfig,
+    learned_ways,
+    point_name,
+    read_lines,
+    run_sweep,
+    table,
+    write_sweep,
+)
+from tagjax.report.study import Trial, importance_bars, parallel_coordinates
 from tagjax.tagattention import TagAttention
 from tagjax.tagattention.tracer_settings import make_tracer, with_values
 from tagjax.training.logging import Logger, LoggerSettings
@@ -136,6 +147,9 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
     assert values[:2] == kept
     _run(command)  # nothing is left to do
     assert len(_states(storage)) == 5
+    (table,) = tmp_path.rglob("trials.md")
+    assert len(table.read_text().splitlines()) == 2 + 4  # those that finished
+    assert (table.parent / "parallel.png").is_file()
 
 
 @pytest.mark.filterwarnings("ignore")  # Optuna's and SQLAlchemy's own
@@ -157,6 +171,51 @@ def test_finished_trials_count_and_running_ones_do_not(tmp_path: Path) -> None:
     assert not folder.exists()
     assert trials_left(1, storage, "one", str(folder)) == 0
     assert folder.is_dir()
+
+
+@pytest.mark.filterwarnings("ignore")  # Optuna's and SQLAlchemy's own
+@pytest.mark.ci
+@_needs("hydra_plugins.hydra_optuna_sweeper", "sweep")
+def test_a_search_is_reported_by_what_it_finished(tmp_path: Path) -> None:
+    import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
+
+    from tagjax.evaluation.study import write_study
+
+    storage = f"sqlite:///{tmp_path / 'optuna.db'}"
+    study = optuna.create_study(study_name="one", storage=storage, direction="minimize")
+    assert not write_study(storage, "one", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+    def score(trial: Any) -> float:
+        if trial.number == 3:
+            raise optuna.TrialPruned
+        rate, flow = trial.suggest_loguniform("rate", 1e-4, 1.0), trial.suggest_categorical("flow", ["dis", "zero"])
+        return np.log10(rate) ** 2 + (0.01 if flow == "zero" else 0.0)
+
+    study.optimize(score, n_trials=16)
+    assert write_study(storage, "one", tmp_path)
+    with (tmp_path / "trials.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 15
+    assert [float(row["score"]) for row in rows] == sorted(float(row["score"]) for row in rows)
+    assert rows[0]["trial"] == str(study.best_trial.number)
+    assert float(rows[0]["rate"]) == pytest.approx(study.best_params["rate"])
+    table = (tmp_path / "trials.md").read_text().splitlines()
+    assert table[0] == "| trial | score | flow | rate |"
+    assert len(table) == 2 + 10
+    for name in ("parallel.png", "importance.png"):
+        assert cv2.imread(str(tmp_path / name)).std() > 5
+
+
+def test_trials_are_drawn_as_lines_across_their_parameters(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    some = [{"rate": 10 ** rng.uniform(-4, 0), "flow": word} for word in ("dis", "zero", "dis")]
+    trials = [Trial(number, 0.1 * number, one) for number, one in enumerate([*some, {"rate": 0.1}])]
+    parallel_coordinates(tmp_path / "all.png", trials, ["flow", "rate"], {"rate"})
+    parallel_coordinates(tmp_path / "one.png", trials[:1], ["flow", "rate"], set())
+    importance_bars(tmp_path / "importance.png", {"rate": 0.7, "flow": 0.3})
+    for name in ("all.png", "one.png", "importance.png"):
+        assert cv2.imread(str(tmp_path / name)).std() > 5
 
 
 OBJECTIVE = """
@@ -350,6 +409,50 @@ def test_whole_numbers_and_words_of_a_grid_stay_what_they_are(tmp_path: Path) ->
     assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
     with pytest.raises(ConfigError, match="cell is 0; expected an integer"):
         run_sweep(_config(tmp_path, grid={"cell": (0,)}), tmp_path / "refused")  # before anything is simulated
+
+
+def test_one_parameter_at_a_time_is_swept_around_the_tracers_own_values(tmp_path: Path) -> None:
+    grid = {"v0_m_s": (0.01, 0.1, 0.5), "alpha_m2": (1e-4, 1e-3)}
+    config = _config(tmp_path, grid=grid, one_at_a_time=True)
+    own = {"v0_m_s": 0.1, "alpha_m2": 5e-4}
+    others = [{**own, "v0_m_s": 0.01}, {**own, "v0_m_s": 0.5}, {**own, "alpha_m2": 1e-4}, {**own, "alpha_m2": 1e-3}]
+    assert config.points() == [own, *others]
+
+    def lines(*iou: float) -> list[Line]:
+        return [
+            dataclasses.replace(_line(point, "a", one + 0.01 * number, 10), recording=str(number))
+            for point, one in zip(config.points(), iou, strict=True)
+            for number in range(5)
+        ]
+
+    found = lines(0.4, 0.2, 0.5, 0.3, 0.4)
+    found[10] = dataclasses.replace(
+        found[10], numbers={**found[10].numbers, "iou": 0.4}
+    )  # of the best point, the first
+    rows = table(found)
+    assert [row["v0_m_s"] for row in rows] == [0.5, 0.1, 0.1, 0.1, 0.01]
+    best, own_values, last = rows[0]["against_best"], rows[1]["against_best"], rows[-1]["against_best"]
+    assert (best.value, best.low, best.high) == (0.0, 0.0, 0.0)
+    assert own_values.value == pytest.approx(np.mean([0.0, -0.1, -0.1, -0.1, -0.1]))
+    assert own_values.low == pytest.approx(-0.1)
+    assert -0.31 < last.low <= last.value <= last.high < 0
+
+    run = tmp_path / "run"
+    run.mkdir()
+    learned = {"untrained": {**own, "beta": 0.8}, "learned": {**own, "v0_m_s": 0.3, "beta": 0.8}}
+    (run / "parameters.json").write_text(json.dumps(learned))
+    config = dataclasses.replace(config, runs=(str(run),))
+    assert learned_ways(config) == {"v0_m_s": [(0.1, 0.3)], "alpha_m2": [(5e-4, 5e-4)]}
+    write_sweep(tmp_path, config, found)
+    assert "| 0.5 | 0.0005 | 0.5" in (tmp_path / "table.md").read_text()
+    assert cv2.imread(str(tmp_path / "sweep.png")).std() > 5
+    with pytest.raises(ConfigError, match=r"runs: found no .*none.parameters\.json; expected finished run folders"):
+        run_sweep(dataclasses.replace(config, runs=(str(tmp_path / "none"),)), tmp_path / "refused")
+    with pytest.raises(ConfigError, match="set one_at_a_time=true, or runs="):
+        dataclasses.replace(config, one_at_a_time=False)
+    (run / "parameters.json").write_text(json.dumps({"untrained": {"v0_m_s": 0.1}, "learned": {"v0_m_s": 0.1}}))
+    with pytest.raises(ConfigError, match="has no parameter alpha_m2; expected runs with the same tracer"):
+        learned_ways(config)
 
 
 def test_lines_cut_short_are_taken_away(tmp_path: Path) -> None:

@@ -146,3 +146,21 @@ def test_gradients_are_finite_and_compiled_is_eager():
 def test_wrong_travel_settings_are_refused(arguments):
     with pytest.raises(ValueError, match="expected"):
         TravellingTogether(**arguments)
+
+
+def test_a_gradient_does_not_grow_with_the_frames():
+    """Where parts drift apart, what is pooled with what depends on all frames before: that path is left out of the gradient."""
+    stage, frames = TravellingTogether(), list(walker(60, noise_m=0.02, apart=True))
+
+    def last(moved_m: jax.Array) -> jax.Array:
+        """The displacements at the end, if those of the second frame were other by this."""
+        state, last_s = stage.init(NUM), jnp.asarray(-0.1)
+        for number, (centre, motion, now_s) in enumerate(frames):
+            given = segment_frame(centre, motion + (moved_m if number == 1 else 0.0), area=AREA)
+            state, *_ = stepped(stage, state, given, last_s, now_s)
+            last_s = now_s
+        return state.displacement_m[:, 0]
+
+    slope = jax.jacrev(last)(jnp.zeros((NUM, 3)))
+    assert float(jnp.max(jnp.sum(jnp.abs(slope), axis=(1, 2)))) <= 1.0 + 1e-4
+    np.testing.assert_allclose(jnp.sum(slope[1:13, :, 0], axis=1), 1.0, atol=1e-4)  # what all move by, each moves by

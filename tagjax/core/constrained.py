@@ -7,10 +7,12 @@ the parameter's type, so no list of names is kept.
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import fnmatch
 import math
 import operator
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -124,6 +126,26 @@ def with_named_values(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
             raise ValueError(f"{name}: {error}") from error
     places = [operator.attrgetter(name) for name in known]
     return eqx.tree_at(lambda m: [place(m) for place in places], module, replaced)
+
+
+def learning_only(module: ModuleT, patterns: Sequence[str]) -> ModuleT:
+    """The module in which gradients reach only the scalars whose dotted name one of the patterns matches (`attention.*`).
+
+    Raises `ValueError` for a pattern that matches no name.
+    """
+    known = _named(module)
+    for pattern in patterns:
+        if not fnmatch.filter(known, pattern):
+            near = difflib.get_close_matches(pattern, known, 5, 0.0)
+            raise ValueError(
+                f"{pattern} is no parameter; expected dotted names, or patterns of them such as body.*, of "
+                f"{len(known)} parameters, for example: {', '.join(near)}."
+            )
+    held = [name for name in known if not any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
+    if not held:
+        return module
+    places = [operator.attrgetter(name) for name in held]
+    return eqx.tree_at(lambda m: [place(m) for place in places], module, replace_fn=jax.lax.stop_gradient)
 
 
 def _named(module: eqx.Module) -> dict[str, Constrained | Array]:

@@ -1,4 +1,4 @@
-"""A grid of a tracer's parameters over suites: IoU against frame number, a table, and the best point.
+"""A grid of a tracer's parameters over suites, or one parameter at a time: IoU, a table, a picture, and the best point.
 
 TagAttention (ToN 2021), Fig. 17 is such a sweep: v0 at 0.01, 0.1 and 0.5 m/s, for a slow and for a fast object. Every
 recording at every point is a line of a file, so that an interrupted sweep can be resumed.
@@ -21,11 +21,12 @@ from ..core.files import write_atomic, writing
 from ..core.progress import OnProgress, unobserved
 from ..core.results import markdown_table, to_json_values, write_csv
 from ..core.settings import ConfigError, changed, from_mapping
+from ..metrics.interval import Estimate, ratio_estimate
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording.store import open_recording
-from ..report.sweep import curve_panels, parameter_panels, value_text
+from ..report.sweep import curve_panels, one_at_a_time_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
-from ..tagattention.tracer_settings import make_tracer, setting_names, tracer_clips, with_values
+from ..tagattention.tracer_settings import make_tracer, named_settings, tracer_clips, with_values
 from ..tracing.clips import ClipSettings, clip_loader
 from .suite_items import result_key
 
@@ -45,7 +46,9 @@ class SweepConfig:
 
     suites: Mapping[str, Mapping[str, Any]]
     tracer: Mapping[str, Any]
-    grid: Mapping[str, tuple[Value, ...]]  # values of the tracer's parameters; all combinations are tried
+    grid: Mapping[str, tuple[Value, ...]]  # values of the tracer's parameters
+    one_at_a_time: bool = False  # each value with the tracer's own of the other parameters; else all combinations
+    runs: tuple[str, ...] = ()  # run folders of experiments.train: from where to where they learned is drawn as well
     clips: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # override the tracer's
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
     recordings_dir: str = "recordings"
@@ -64,7 +67,11 @@ class SweepConfig:
             raise ConfigError(
                 "grid is empty; expected values of the tracer's parameters, for example 'grid={v0_m_s:[0.01,0.1,0.5]}'."
             )
-        known = setting_names(self.tracer)
+        if self.runs and not self.one_at_a_time:
+            raise ConfigError(
+                "runs are drawn over a sweep of one parameter at a time; set one_at_a_time=true, or runs=[]."
+            )
+        known = named_settings(self.tracer)
         if unknown := sorted(set(self.grid) - set(known)):
             near = sorted(known if len(known) <= _MAX_NAMES else difflib.get_close_matches(unknown[0], known, 5, 0.0))
             raise ConfigError(
@@ -76,8 +83,17 @@ class SweepConfig:
         """The clip settings of the tracer's configuration, overridden by `clips`."""
         return changed(tracer_clips(self.tracer), self.clips, where="clips")
 
+    def own(self) -> dict[str, Value]:
+        """The tracer's own values of the grid's parameters."""
+        known = named_settings(self.tracer)
+        return {name: known[name] for name in self.grid}
+
     def points(self) -> list[dict[str, Value]]:
-        """Every combination of the grid's values."""
+        """Every combination of the grid's values; or the tracer's own, and those that differ from it in one."""
+        if self.one_at_a_time:
+            own = self.own()
+            others = [{**own, name: value} for name, values in self.grid.items() for value in values]
+            return [own, *(point for point in others if point != own)]
         return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
 
 
@@ -99,6 +115,7 @@ def run_sweep(config: SweepConfig, folder: Path, *, on_progress: OnProgress = un
     Lines that the folder holds already are not computed again. `on_progress` counts the lines.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    learned_ways(config)  # a folder that is no run's raises before the work starts
     points, clips = config.points(), config.clip_settings()
     tracers = [
         make_tracer(with_values(config.tracer, point)) for point in points
@@ -211,8 +228,10 @@ def point_name(point: Mapping[str, Value]) -> str:
 def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
     """A row for each point, the best first: mean box IoU over conditions, and IoU and lock of each condition.
 
-    Within a condition every scored frame has the same weight, and every condition has the same weight.
+    Within a condition every scored frame has the same weight, and every condition has the same weight. `against_best` is the
+    `Estimate` of the mean difference from the best point, where every recording has the same weight.
     """
+    lines = list(lines)
     rows: dict[str, dict[str, Any]] = {}
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
@@ -226,22 +245,72 @@ def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
         rows[point][f"{condition}: locked"] = float(np.mean(locked)) if locked else math.nan
     for row in rows.values():
         row["IoU"] = float(np.mean([value for name, value in row.items() if name.endswith(": IoU")]))
-    return sorted(rows.values(), key=lambda row: -row["IoU"])
+    ordered = sorted(rows, key=lambda point: -rows[point]["IoU"])
+    iou = {point: _by_recording(lines, point) for point in ordered}
+    for point in ordered:
+        shared = [name for name in iou[point] if name in iou[ordered[0]]]
+        against = np.array([iou[point][name] - iou[ordered[0]][name] for name in shared])
+        rows[point]["against_best"] = ratio_estimate(against, np.ones(len(shared), np.int64))
+    return [rows[point] for point in ordered]
+
+
+def _by_recording(lines: Iterable[Line], point: str) -> dict[tuple[str, str], float]:
+    """The mean box IoU of each recording at a point; of those with a frame that counts."""
+    return {
+        (one.condition, one.recording): float(one.numbers["iou"] or 0.0)
+        for one in lines
+        if point_name(one.point) == point and one.numbers["num_frames"]
+    }
+
+
+def learned_ways(config: SweepConfig) -> dict[str, list[tuple[float, float]]]:
+    """For each parameter of the grid, the values with which `config.runs` began and ended."""
+    ways: dict[str, list[tuple[float, float]]] = {name: [] for name in config.grid}
+    for run in config.runs:
+        path = Path(run) / "parameters.json"
+        if not path.is_file():
+            raise ConfigError(f"runs: found no {path}; expected finished run folders of experiments.train.")
+        found = json.loads(path.read_text(encoding="utf-8"))
+        begun = found.get("untrained") or found.get("initial") or {}
+        for name, way in ways.items():
+            if name not in begun:
+                raise ConfigError(f"runs: {path} has no parameter {name}; expected runs with the same tracer.")
+            way.append((begun[name], found["learned"][name]))
+    return ways
 
 
 def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> None:
     """table.csv, table.md and sweep.png."""
     rows = table(lines)
     conditions = list(dict.fromkeys(line.condition for line in lines))
-    headings = [*config.grid, "IoU", *(f"{one}: {what}" for one in conditions for what in ("IoU", "locked"))]
-    write_csv(folder / "table.csv", headings, ([row[heading] for heading in headings] for row in rows))
+    headings = ["IoU", *(f"{one}: {what}" for one in conditions for what in ("IoU", "locked"))]
+    against = [row["against_best"] for row in rows]
+    write_csv(
+        folder / "table.csv",
+        [*config.grid, *headings, "against the best", "low", "high"],
+        (
+            [*(row[name] for name in (*config.grid, *headings)), one.value, one.low, one.high]
+            for row, one in zip(rows, against, strict=True)
+        ),
+    )
     cells = [
-        [value_text(row[heading]) if heading in config.grid else f"{row[heading]:.3f}" for heading in headings]
-        for row in rows
+        [
+            *(value_text(row[name]) for name in config.grid),
+            *(f"{row[heading]:.3f}" for heading in headings),
+            _against_text(one),
+        ]
+        for row, one in zip(rows, against, strict=True)
     ]
-    write_atomic(folder / "table.md", markdown_table(headings, cells) + "\n")
+    write_atomic(folder / "table.md", markdown_table([*config.grid, *headings, "against the best"], cells) + "\n")
     points = config.points()
-    if len(points) <= _MAX_CURVES:
+    if config.one_at_a_time:
+        own, ways = config.own(), learned_ways(config)
+        around = {
+            name: {row[name]: row["against_best"] for row in rows if {**row, name: own[name]}.items() >= own.items()}
+            for name in config.grid
+        }
+        one_at_a_time_panels(folder / "sweep.png", around, own, ways, best_iou=rows[0]["IoU"])
+    elif len(points) <= _MAX_CURVES:
         curves = {
             condition: {
                 point_name(point): _mean_curve(
@@ -258,6 +327,13 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
             for name, values in config.grid.items()
         }
         parameter_panels(folder / "sweep.png", best)
+
+
+def _against_text(one: Estimate) -> str:
+    if one.value is None:
+        return "-"
+    interval = "" if one.low is None or one.high is None else f" [{one.low:.3f}, {one.high:.3f}]"
+    return f"{one.value:.3f}{interval}"
 
 
 def _mean_curve(ones: Sequence[Sequence[float | None]]) -> np.ndarray:

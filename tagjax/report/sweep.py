@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from ..metrics.interval import Estimate
 from .figure import blank, save_figure
+
+_WIDE = 20.0  # a range of values whose ends have this ratio is drawn on a logarithmic axis
 
 
 def value_text(value: int | float | str | bool) -> str:
@@ -46,4 +50,55 @@ def parameter_panels(path: Path, best: Mapping[str, Mapping[int | float | str | 
         axes.set(xlabel=name)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("best mean box IoU")
+    save_figure(figure, path, dpi=120)
+
+
+def one_at_a_time_panels(
+    path: Path,
+    against_best: Mapping[str, Mapping[Any, Estimate]],
+    own: Mapping[str, Any],
+    ways: Mapping[str, Sequence[tuple[float, float]]],
+    *,
+    best_iou: float,
+) -> None:
+    """Write a PNG with a panel for each parameter: box IoU at its values, the others being the tracer's own.
+
+    The bars are intervals of the difference from the best point of all, whose IoU is the dashed line: a bar that reaches it is of
+    a point that is not known to be worse. Arrows below lead from where runs began to where they ended.
+    """
+    figure = blank(3.4 * len(against_best), 3.5)
+    panels = figure.subplots(1, len(against_best), sharey=True, squeeze=False)[0]
+    for axes, (name, found) in zip(panels, against_best.items(), strict=True):
+        words = any(isinstance(value, str | bool) for value in found)
+        values = sorted(found, key=str if words else None)
+        at = np.arange(len(values)) if words else np.array(values, float)
+        iou = best_iou + np.array([found[value].value or 0.0 for value in values])
+        low, high = (
+            best_iou + np.array([np.nan if end is None else end for end in ends])
+            for ends in ([found[value].low for value in values], [found[value].high for value in values])
+        )
+        errors = np.nan_to_num(np.stack([iou - low, high - iou]))
+        axes.errorbar(at, iou, yerr=np.maximum(errors, 0.0), fmt="o-", markersize=4, linewidth=1.2, capsize=2.5)
+        axes.axhline(best_iou, color="0.4", linestyle="--", linewidth=1)
+        if words:
+            axes.set_xticks(at, [value_text(value) for value in values])
+        elif at.min() > 0 and at.max() / at.min() > _WIDE:
+            axes.set_xscale("log")
+        bottom = axes.get_xaxis_transform()
+        for number, (begun, ended) in enumerate(ways.get(name, ())):
+            height = 0.05 + 0.05 * number
+            colour = f"C{number + 1}"
+            axes.annotate(
+                "", (ended, height), (begun, height), xycoords=bottom, textcoords=bottom,
+                arrowprops={"arrowstyle": "->", "color": colour, "shrinkA": 0, "shrinkB": 0},
+            )  # fmt: skip
+            axes.plot([begun], [height], "o", color=colour, fillstyle="none", markersize=5, transform=bottom)
+        if not words:
+            axes.axvline(float(own[name]), color="0.8", linewidth=1, zorder=0)
+        axes.set(xlabel=name)
+        axes.grid(alpha=0.3)
+    if any(ways.values()):  # room for the arrows
+        low, high = panels[0].get_ylim()
+        panels[0].set_ylim(low - 0.25 * (high - low), high)
+    panels[0].set_ylabel("box IoU")
     save_figure(figure, path, dpi=120)

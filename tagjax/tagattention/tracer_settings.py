@@ -45,9 +45,10 @@ def make_tracer(settings: Mapping[str, Any], weights: str | None = None) -> Abst
     return load_parameters(tracer, weights, parameters)
 
 
-def setting_names(settings: Mapping[str, Any]) -> list[str]:
-    """The tracer's own settings by dotted name (`dwell.memory_s`)."""
-    return sorted(flat(without_clips(settings)).keys() - {"_target_"})
+def named_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The tracer's own settings by dotted name (`dwell.memory_s`), in the order of the names."""
+    named = flat(without_clips(settings))
+    return {name: named[name] for name in sorted(named) if name != "_target_"}
 
 
 def with_values(settings: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

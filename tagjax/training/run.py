@@ -20,6 +20,7 @@ from ..core.results import to_json_values, write_json
 from ..recording import Recording
 from ..report.page import PAGE, write_page
 from ..report.report import score_table
+from ..tagattention import TagAttention
 from ..tagattention.learned import LearnableTracer, save_parameters
 from ..tagattention.tracer_settings import baseline_clips, make_tracer
 from ..tracing.tracer import AbstractTracer
@@ -28,6 +29,7 @@ from .config import TrainConfig
 from .data import TrainingData, training_data
 from .evaluate import evaluate_tracers, parameters, smoothing_tracers
 from .flow_run import initial_network
+from .hindsight import HindsightSettings
 from .joint import JointModel, save_network
 from .logging import Logger
 from .loop import TrainingResult, resume_state, train
@@ -41,6 +43,8 @@ from .step import ClipLike, clip_loss, make_joint_optimizer, make_optimizer, tra
 def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
     """The untrained model of a run: the tracer, with a flow network if `config.joint` is set."""
     tracer = make_tracer(config.tracer, config.weights)
+    if isinstance(config.learned, HindsightSettings) and isinstance(tracer, TagAttention):
+        config.learned.learning(tracer)  # a wrong name is refused before the work starts
     if config.joint is None:
         return tracer
     network = initial_network(config.joint.flow, config.joint.init)

@@ -13,6 +13,7 @@ class Association(eqx.Module):
     """Each tag's body among the segments of a frame."""
 
     membership: Float[Array, "tag segment"]  # probability that a segment belongs to the tag's body
+    place: Float[Array, "tag segment"]  # probability that the tag is at this of all moving segments
     centre_m: Float[Array, "tag 3"]
     step_m: Float[Array, "tag antenna"]  # change of the body's range since the last frame
     nats: Explanations  # that of the body is 0 without one, that of a free path without the stage

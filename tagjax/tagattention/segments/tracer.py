@@ -267,6 +267,7 @@ class TagAttention(AbstractSmoother):
         )
         return TagState(now_s, travel, dwell, attention, body, competition, hidden, free, recent), Association(
             membership=membership,
+            place=place,
             centre_m=centre_m,
             step_m=mean(found.increment_m.T),
             nats=nats,

@@ -126,7 +126,9 @@ class TravellingTogether(eqx.Module):
             source, centre_m, jnp.where(found.in_view, area, 0.0), active, there & (fastest > 0), newborn, speed
         )
 
-        centre, lagged = centre_m[active], lagged_m[active]
+        # How far they have travelled is taken as given: each frame's pooling depends on it sharply, and it on the pooling of
+        # all frames before, so that the gradient through both grows beyond bounds.
+        centre, lagged = centre_m[active], jax.lax.stop_gradient(lagged_m[active])
         measured = there & known[active] & ~newborn[active]
         weight = self._kernel(centre, lagged) * jnp.where(measured, area[active], 0.0)[None]
         total = jnp.sum(weight, axis=1)

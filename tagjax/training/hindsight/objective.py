@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PyTree
 
+from ...core.constrained import learning_only
 from ...core.numerics import safe_divide
 from ...core.settings import ConfigError
 from ...tagattention.segments import Detection, TagAttention
 from ...tagattention.segments.detection import Explanations, RecentReads
 from ...tracing.tracer import AbstractTracer, Camera
-from ..fading import faded
 from .likelihood import FilmedFrames, moved_by_flow, read_nats
 from .pieces import PieceFrames, frame_of
 from .teachers import Teacher
@@ -32,12 +32,13 @@ class HindsightSettings:
     sure: float = (
         0.9  # a mask counts where the teacher's confidence is above this, its silence where below 1 minus this
     )
-    memory: float = 0.9  # fraction of the gradient that a frame passes to the frame before
     clip_norm: float = 0.3  # of a piece's gradient, at most: some have 50 times the median
     piece_frames: int = 256  # a recording is cut into pieces of at most so many frames
     teacher: Teacher = "smoother"  # or labels: the true masks of simulated recordings, to compare with
-    # masks: all stages but detection; confidence: detection; reads: the reader's noise, and with `joint` the flow
-    learn: Literal["all", "masks", "confidence", "reads"] = "all"
+    # masks: what belongs to the body, all stages but detection; confidence: detection; all: both;
+    # place: on which body the tag is, by all stages that say so; reads: the reader's noise, and with `joint` the flow
+    learn: Literal["all", "masks", "place", "confidence", "reads"] = "all"
+    parameters: tuple[str, ...] | None = None  # dotted names of those that are learned, or patterns (body.*); None: all
     controls: float = 0.0  # of the confidence: fraction of reads taken to belong to nothing in view; 0: none
     pieces: str | None = None  # folder that keeps the pieces for later runs; None: the run folder, until the run ends
     term_norms: ClassVar[bool] = False  # there is one term
@@ -45,8 +46,6 @@ class HindsightSettings:
     def __post_init__(self) -> None:
         if not 0.5 <= self.sure < 1:
             raise ConfigError(f"sure is {self.sure}; expected a confidence from 0.5 to 1, 1 excluded.")
-        if not 0 <= self.memory <= 1:
-            raise ConfigError(f"memory is {self.memory}; expected a fraction from 0 to 1.")
         if not self.clip_norm > 0:
             raise ConfigError(f"clip_norm is {self.clip_norm}; expected a positive norm.")
         if self.piece_frames < 1:
@@ -63,6 +62,15 @@ class HindsightSettings:
         """The weight of each term."""
         return {"hindsight": 1.0}
 
+    def learning(self, tracer: TagAttention) -> TagAttention:
+        """The tracer in which gradients reach `parameters` only. Raises `ConfigError` for one that it does not have."""
+        if self.parameters is None:
+            return tracer
+        try:
+            return learning_only(tracer, self.parameters)
+        except ValueError as error:
+            raise ConfigError(f"hindsight.parameters: {error}") from error
+
     def bounded(self, gradient: PyTree) -> PyTree:
         """The gradient of a piece, scaled to at most `clip_norm`."""
         norm = optax.tree.norm(gradient)
@@ -73,6 +81,7 @@ class HindsightSettings:
     ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
         """The loss of a piece, and what it consists of."""
         assert isinstance(tracer, TagAttention)
+        tracer = self.learning(tracer)
         if isinstance(frames, FilmedFrames):
             frames = moved_by_flow(tracer.segments, camera, frames)
         if self.learn == "reads":
@@ -82,12 +91,15 @@ class HindsightSettings:
             mean = safe_divide(jnp.sum(nats), jnp.sum(number))
             return {"hindsight": -mean}, {"nats": mean}
         sums, loss = hindsight_sums(tracer, camera, frames, self), jnp.zeros(())
-        if self.learn != "confidence":
+        if self.learn == "place":
+            loss = loss + safe_divide(sums.surprise, sums.num_there)
+        if self.learn in ("all", "masks"):
             loss = loss + safe_divide(sums.missed, sums.num_there)
-        if self.learn != "masks":
+        if self.learn in ("all", "confidence"):
             loss = loss + safe_divide(sums.wrong, sums.num_there + sums.num_away)
         logged = {
             "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
+            "place_nats": safe_divide(sums.surprise, sums.num_there),
             "false_confidence": safe_divide(sums.claimed, sums.num_away),
         }
         if frames.control is not None:
@@ -101,6 +113,7 @@ class HindsightSums(NamedTuple):
     """Sums over the tag-frames of which the teacher is sure, and their numbers."""
 
     missed: Float[Array, ""]  # 1 - IoU where the teacher sees the object
+    surprise: Float[Array, ""]  # there as well: -log of the probability that the tag is in the teacher's mask, nats
     wrong: Float[Array, ""]  # (confidence - 1)^2 where the mask is right, confidence^2 elsewhere
     claimed: Float[Array, ""]  # confidence where it sees nothing
     num_there: Float[Array, ""]
@@ -133,27 +146,29 @@ class _Apart(eqx.Module):
 def hindsight_sums(
     tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings
 ) -> HindsightSums:
-    """The two questions of each tag-frame: where the object is, and how sure one may be of it.
+    """The questions of each tag-frame: where the tag is, what belongs to the object, and how sure one may be of it.
 
-    IoU is the soft one of the teacher's mask and the tracer's, on segments weighted by their areas. The confidence should be
-    the probability that the mask is right, that is, of an IoU above 0.3: its squared error is least where it is (a
+    Place: the log score of the probability that the tag is in the teacher's mask, which is wrong with the probability
+    1 - `sure`. Its gradient does not vanish where the tracer is sure and wrong, as that of the overlap does. Mask: IoU is the
+    soft one of the teacher's mask and the tracer's, on segments weighted by their areas. Confidence: it should be the
+    probability that the mask is right, that is, of an IoU above 0.3: its squared error is least where it is (a
     proper score; Brier, 1950). The mask does not depend on detection, so it teaches every other stage; the confidence carries no
     gradient to what detection is given, so it teaches detection alone. Where that is all that learns, no other backward pass is made.
     """
     if settings.learn == "confidence":
-        overlap, confidence, size = _of_detection(tracer, camera, frames, settings.memory)
+        overlap, inside, confidence, size = _of_detection(tracer, camera, frames)
     else:
         apart = eqx.tree_at(lambda one: one.detection, tracer, replace_fn=_Apart)
-        overlap, confidence, size = _scanned(
-            apart, camera, frames, lambda state: faded(state, settings.memory), jax.checkpoint
-        )
+        overlap, inside, confidence, size = _scanned(apart, camera, frames, lambda state: state, jax.checkpoint)
     there = frames.present & (frames.confidence > settings.sure) & (size > 0)
     away = frames.present & (frames.confidence < 1.0 - settings.sure)
     right = jnp.where(there & (overlap > _RIGHT), 1.0, 0.0)
     wrong = jnp.where(there | away, (confidence - right) ** 2, 0.0)
+    surprise = -jnp.log(settings.sure * inside + (1.0 - settings.sure))
 
     return HindsightSums(
         missed=jnp.sum(jnp.where(there, 1.0 - overlap, 0.0)),
+        surprise=jnp.sum(jnp.where(there, surprise, 0.0)),
         wrong=jnp.sum(wrong),
         claimed=jnp.sum(jnp.where(away, confidence, 0.0)),
         num_there=jnp.sum(there.astype(wrong.dtype)),
@@ -164,20 +179,17 @@ def hindsight_sums(
 def control_sums(tracer: TagAttention, camera: Camera, frames: PieceFrames, settings: HindsightSettings) -> ControlSums:
     """How sure the tracer is of tags whose reads belong to nothing in view. Detection alone learns from it."""
     frames = frames.of_control()
-    _, confidence, _ = _of_detection(tracer, camera, frames, settings.memory)
+    _, _, confidence, _ = _of_detection(tracer, camera, frames)
     claimed = jnp.where(frames.present, confidence, 0.0)
     return ControlSums(jnp.sum(claimed**2), jnp.sum(claimed), jnp.sum(frames.present.astype(claimed.dtype)))
 
 
-def _of_detection(
-    tracer: TagAttention, camera: Camera, frames: PieceFrames, memory: float
-) -> tuple[Array, Array, Array]:
+def _of_detection(tracer: TagAttention, camera: Camera, frames: PieceFrames) -> tuple[Array, Array, Array, Array]:
     """`_scanned` with gradients of detection only: the backward pass goes through its recent reads, and traces nothing again."""
     tracer = eqx.tree_at(lambda one: one.detection, jax.lax.stop_gradient(tracer), tracer.detection)
 
     def before(state: Any) -> Any:
-        recent = faded(state.recent, memory)
-        return eqx.tree_at(lambda one: one.recent, jax.lax.stop_gradient(state), recent)
+        return eqx.tree_at(lambda one: one.recent, jax.lax.stop_gradient(state), state.recent)
 
     return _scanned(tracer, camera, frames, before, lambda step, **_: step)
 
@@ -188,17 +200,21 @@ def _scanned(
     frames: PieceFrames,
     before: Callable[[Any], Any],
     wrapped: Callable[..., Callable[..., Any]],
-) -> tuple[Float[Array, "time tag"], Float[Array, "time tag"], Float[Array, "time tag"]]:
-    """Soft IoU with the target, confidence, and the target's area, pixels. `before` is done to the state at each frame."""
+) -> tuple[Float[Array, "time tag"], Float[Array, "time tag"], Float[Array, "time tag"], Float[Array, "time tag"]]:
+    """Soft IoU with the target, probability that the tag is in it, confidence, and the target's area, pixels.
+
+    `before` is done to the state at each frame.
+    """
     frames = dataclasses.replace(frames, control=None)
 
-    def step(state: Any, frame: PieceFrames) -> tuple[Any, tuple[Array, Array, Array]]:
+    def step(state: Any, frame: PieceFrames) -> tuple[Any, tuple[Array, Array, Array, Array]]:
         seen = frame_of(frame, camera.antennas_m.shape[0])
         state, out = tracer.associate(camera, before(state), frame.found, seen)
         area = frame.found.area
         both = out.membership * frame.target
         overlap = safe_divide(both @ area, (out.membership + frame.target - both) @ area)
-        return state, (overlap, out.confidence, frame.target @ area)
+        inside = jnp.sum(out.place * frame.target, axis=1)
+        return state, (overlap, inside, out.confidence, frame.target @ area)
 
     num_antennas, num_tags = camera.antennas_m.shape[0], frames.present.shape[1]
     begin = tracer.no_reads(num_tags, num_antennas, frames.radio.relative_m.shape[-1], frames.time_s[0])
