@@ -31,6 +31,7 @@ from ..tracing.clips import ClipSettings, clip_loader
 from .suite_items import result_key
 
 _MAX_NAMES = 12  # of parameters in an error
+_MAX_CONDITIONS = 4  # in the columns of table.md; table.csv has all
 _MAX_CURVES = 6
 """Up to this many points are plotted as one curve each; more are plotted by parameter."""
 
@@ -293,15 +294,16 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
             for row, one in zip(rows, against, strict=True)
         ),
     )
+    shown = headings if len(conditions) <= _MAX_CONDITIONS else headings[:1]
     cells = [
         [
             *(value_text(row[name]) for name in config.grid),
-            *(f"{row[heading]:.3f}" for heading in headings),
+            *(f"{row[heading]:.3f}" for heading in shown),
             _against_text(one),
         ]
         for row, one in zip(rows, against, strict=True)
     ]
-    write_atomic(folder / "table.md", markdown_table([*config.grid, *headings, "against the best"], cells) + "\n")
+    write_atomic(folder / "table.md", markdown_table([*config.grid, *shown, "against the best"], cells) + "\n")
     points = config.points()
     if config.one_at_a_time:
         own, ways = config.own(), learned_ways(config)

@@ -45,7 +45,7 @@ def parallel_coordinates(
     axes.set_yticks([])
     axes.spines[["top", "right", "left", "bottom"]].set_visible(False)
     figure.colorbar(colour, ax=axes, label="score", pad=0.02)
-    save_figure(figure, path, dpi=120)
+    save_figure(figure, path, dpi=90)
 
 
 def _heights(axes: Axes, at: int, name: str, trials: Sequence[Trial], logarithmic: bool) -> np.ndarray:

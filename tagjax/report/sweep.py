@@ -66,9 +66,14 @@ def one_at_a_time_panels(
     The bars are intervals of the difference from the best point of all, whose IoU is the dashed line: a bar that reaches it is of
     a point that is not known to be worse. Arrows below lead from where runs began to where they ended.
     """
-    figure = blank(3.4 * len(against_best), 3.5)
-    panels = figure.subplots(1, len(against_best), sharey=True, squeeze=False)[0]
-    for axes, (name, found) in zip(panels, against_best.items(), strict=True):
+    columns = min(2, len(against_best))
+    rows = -(-len(against_best) // columns)
+    figure = blank(4.2 * columns, 3.1 * rows)
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    panels = grid.ravel()
+    for axes in panels[len(against_best) :]:
+        axes.set_axis_off()
+    for axes, (name, found) in zip(panels, against_best.items(), strict=False):
         words = any(isinstance(value, str | bool) for value in found)
         values = sorted(found, key=str if words else None)
         at = np.arange(len(values)) if words else np.array(values, float)
@@ -99,6 +104,8 @@ def one_at_a_time_panels(
         axes.grid(alpha=0.3)
     if any(ways.values()):  # room for the arrows
         low, high = panels[0].get_ylim()
+        panels[0].set_yticks([tick for tick in panels[0].get_yticks() if max(low, 0.0) <= tick <= high])
         panels[0].set_ylim(low - 0.25 * (high - low), high)
-    panels[0].set_ylabel("box IoU")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("box IoU")
     save_figure(figure, path, dpi=120)

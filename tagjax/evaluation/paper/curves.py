@@ -103,7 +103,17 @@ def _draw(
         f"{panel.title}: " + ", ".join(f"{late_iou(lines):.2f} {_plain(name)}" for name, lines in panel.lines.items())
         for panel in chosen
     ]
-    return f"Mean box IoU from frame {_SETTLED} to {NUM_FRAMES} after the first motion: {'; '.join(parts)}."
+    mean = f"Mean box IoU from frame {_SETTLED} to {NUM_FRAMES} after the first motion: {'; '.join(parts)}."
+    return mean + _frames_that_count([next(iter(panel.lines.values()))["iou"] for panel in chosen])
+
+
+def _frames_that_count(curves: Sequence[Curve]) -> str:
+    """A sentence where in some of the frames that the mean is over no recording has a tag that counts; else nothing."""
+    total = NUM_FRAMES + 1 - _SETTLED
+    counted = [int(np.sum(one.num_tags[_SETTLED : NUM_FRAMES + 1] > 0)) for one in curves]
+    if min(counted) == total:
+        return ""
+    return f" Some recording has its tag wholly in view in {', '.join(map(str, counted))} of these {total} frames."
 
 
 def late_iou(curves: Mapping[str, Curve]) -> float:
