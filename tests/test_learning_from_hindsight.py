@@ -44,7 +44,7 @@ def piece() -> Piece:
 
 
 @eqx.filter_jit
-def _associated(tracer: TagAttention, piece_frames: Any, camera: Any) -> tuple[Any, Any]:
+def _associated(tracer: TagAttention, piece_frames: Any, camera: Any) -> tuple[Any, Any, Any]:
     def step(state: Any, frame: Any) -> tuple[Any, Any]:
         state, out = tracer.associate(camera, state, frame.found, frame_of(frame, camera.antennas_m.shape[0]))
         return state, (out.membership, out.place, out.confidence)

@@ -185,7 +185,9 @@ def test_the_late_mean_weighs_each_tag_alike():
     assert np.isnan(curves.late_iou({"iou": curve([0.3] * 20, [2] * 20)}))
     gap = curve([0.5] * 91, [2] * 60 + [0] * 10 + [2] * 21)
     assert curves._frames_that_count([curve([0.5] * 91, [2] * 91)]) == ""
-    assert curves._frames_that_count([curve([0.5] * 91, [2] * 91), gap]).endswith("in view in 51, 41 of these 51 frames.")
+    assert curves._frames_that_count([curve([0.5] * 91, [2] * 91), gap]).endswith(
+        "in view in 51, 41 of these 51 frames."
+    )
 
 
 def test_a_curve_ends_where_half_of_its_tags_are_left():
