@@ -149,9 +149,9 @@ def test_a_killed_optuna_sweep_goes_on(recordings: list[str], tmp_path: Path) ->
     assert len(_states(storage)) == 5
     tables = list(tmp_path.rglob("trials.md"))
     assert len(tables) == 2  # of the launches that came to their end, each with all trials that finished
-    for table in tables:
-        assert len(table.read_text().splitlines()) == 2 + 4
-        assert (table.parent / "parallel.png").is_file()
+    for one in tables:
+        assert len(one.read_text().splitlines()) == 2 + 4
+        assert (one.parent / "parallel.png").is_file()
 
 
 @pytest.mark.filterwarnings("ignore")  # Optuna's and SQLAlchemy's own
