@@ -428,9 +428,8 @@ def test_one_parameter_at_a_time_is_swept_around_the_tracers_own_values(tmp_path
         ]
 
     found = lines(0.4, 0.2, 0.5, 0.3, 0.4)
-    found[10] = dataclasses.replace(
-        found[10], numbers={**found[10].numbers, "iou": 0.4}
-    )  # of the best point, the first
+    first_of_best = found[10]
+    found[10] = dataclasses.replace(first_of_best, numbers={**first_of_best.numbers, "iou": 0.4})
     rows = table(found)
     assert [row["v0_m_s"] for row in rows] == [0.5, 0.1, 0.1, 0.1, 0.01]
     best, own_values, last = rows[0]["against_best"], rows[1]["against_best"], rows[-1]["against_best"]

@@ -23,12 +23,12 @@ def write_study(storage: str, name: str, folder: Path) -> bool:
     import optuna  # pyright: ignore[reportMissingImports]  # of the sweep extra
 
     study = optuna.load_study(study_name=name, storage=storage)
-    done = [one for one in study.trials if one.state is optuna.trial.TrialState.COMPLETE and one.value is not None]
+    done = [one for one in study.trials if one.state is optuna.trial.TrialState.COMPLETE]
     if not done:
         return False
     largest_first = study.direction is optuna.study.StudyDirection.MAXIMIZE
-    trials = sorted((Trial(one.number, float(one.value or 0.0), one.params) for one in done), key=lambda one: one.value)
-    trials = trials[::-1] if largest_first else trials
+    trials = [Trial(one.number, one.value, one.params) for one in done if one.value is not None]
+    trials.sort(key=lambda one: one.value, reverse=largest_first)
     names = sorted({name for one in trials for name in one.parameters})
     logs = optuna.distributions.LogUniformDistribution, optuna.distributions.IntLogUniformDistribution
     logarithmic = {name for one in done for name, space in one.distributions.items() if isinstance(space, logs)}

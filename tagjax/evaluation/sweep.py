@@ -21,13 +21,14 @@ from ..core.files import write_atomic, writing
 from ..core.progress import OnProgress, unobserved
 from ..core.results import markdown_table, to_json_values, write_csv
 from ..core.settings import ConfigError, changed, from_mapping
-from ..metrics.interval import Estimate, ratio_estimate
+from ..metrics.interval import ratio_estimate
 from ..metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording
 from ..recording.store import open_recording
 from ..report.sweep import curve_panels, one_at_a_time_panels, parameter_panels, value_text
 from ..sim.suites import SPLITS, Item, Suite, make_items
 from ..tagattention.tracer_settings import make_tracer, named_settings, tracer_clips, with_values
 from ..tracing.clips import ClipSettings, clip_loader
+from .estimate_text import estimate_text
 from .suite_items import result_key
 
 _MAX_NAMES = 12  # of parameters in an error
@@ -232,12 +233,16 @@ def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
     Within a condition every scored frame has the same weight, and every condition has the same weight. `against_best` is the
     `Estimate` of the mean difference from the best point, where every recording has the same weight.
     """
-    lines = list(lines)
     rows: dict[str, dict[str, Any]] = {}
     groups: dict[tuple[str, str], list[Line]] = {}
+    recordings: dict[str, dict[tuple[str, str], float]] = {}  # box IoU of those with a frame that counts
     for line in lines:
-        rows.setdefault(point_name(line.point), {**line.point})
-        groups.setdefault((point_name(line.point), line.condition), []).append(line)
+        point = point_name(line.point)
+        rows.setdefault(point, {**line.point})
+        groups.setdefault((point, line.condition), []).append(line)
+        iou = recordings.setdefault(point, {})
+        if line.numbers["num_frames"]:
+            iou[line.condition, line.recording] = float(line.numbers["iou"] or 0.0)
     for (point, condition), ones in groups.items():
         count = sum(int(one.numbers["num_frames"] or 0) for one in ones)
         total = sum(float(one.numbers["iou"] or 0.0) * int(one.numbers["num_frames"] or 0) for one in ones)
@@ -247,21 +252,11 @@ def table(lines: Iterable[Line]) -> list[dict[str, Any]]:
     for row in rows.values():
         row["IoU"] = float(np.mean([value for name, value in row.items() if name.endswith(": IoU")]))
     ordered = sorted(rows, key=lambda point: -rows[point]["IoU"])
-    iou = {point: _by_recording(lines, point) for point in ordered}
     for point in ordered:
-        shared = [name for name in iou[point] if name in iou[ordered[0]]]
-        against = np.array([iou[point][name] - iou[ordered[0]][name] for name in shared])
-        rows[point]["against_best"] = ratio_estimate(against, np.ones(len(shared), np.int64))
+        best, own = recordings[ordered[0]], recordings[point]
+        against = np.array([own[name] - best[name] for name in own if name in best])
+        rows[point]["against_best"] = ratio_estimate(against, np.ones(len(against), np.int64))
     return [rows[point] for point in ordered]
-
-
-def _by_recording(lines: Iterable[Line], point: str) -> dict[tuple[str, str], float]:
-    """The mean box IoU of each recording at a point; of those with a frame that counts."""
-    return {
-        (one.condition, one.recording): float(one.numbers["iou"] or 0.0)
-        for one in lines
-        if point_name(one.point) == point and one.numbers["num_frames"]
-    }
 
 
 def learned_ways(config: SweepConfig) -> dict[str, list[tuple[float, float]]]:
@@ -299,7 +294,7 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
         [
             *(value_text(row[name]) for name in config.grid),
             *(f"{row[heading]:.3f}" for heading in shown),
-            _against_text(one),
+            estimate_text(one, digits=3),
         ]
         for row, one in zip(rows, against, strict=True)
     ]
@@ -329,13 +324,6 @@ def write_sweep(folder: Path, config: SweepConfig, lines: Sequence[Line]) -> Non
             for name, values in config.grid.items()
         }
         parameter_panels(folder / "sweep.png", best)
-
-
-def _against_text(one: Estimate) -> str:
-    if one.value is None:
-        return "-"
-    interval = "" if one.low is None or one.high is None else f" [{one.low:.3f}, {one.high:.3f}]"
-    return f"{one.value:.3f}{interval}"
 
 
 def _mean_curve(ones: Sequence[Sequence[float | None]]) -> np.ndarray:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..metrics.interval import Estimate
 from .figure import blank, save_figure
 
-_WIDE = 20.0  # a range of values whose ends have this ratio is drawn on a logarithmic axis
+_WIDE = 20.0  # the axis is logarithmic where the largest value is more than so many times the smallest
 
 
 def value_text(value: int | float | str | bool) -> str:
@@ -63,8 +63,8 @@ def one_at_a_time_panels(
 ) -> None:
     """Write a PNG with a panel for each parameter: box IoU at its values, the others being the tracer's own.
 
-    The bars are intervals of the difference from the best point of all, whose IoU is the dashed line: a bar that reaches it is of
-    a point that is not known to be worse. Arrows below lead from where runs began to where they ended.
+    The dashed line is the best point of all. A bar is the interval of a point's difference from it; where the bar reaches the
+    line, the point may be as good. Arrows at the bottom lead from the values with which runs began to those that they learned.
     """
     columns = min(2, len(against_best))
     rows = -(-len(against_best) // columns)
