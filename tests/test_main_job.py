@@ -123,6 +123,13 @@ def test_what_was_learned_is_kept_where_nothing_is_held_out(
     assert parameters(kept) == pytest.approx(parameters(learned), rel=1e-6)
     assert set(json.loads((tmp_path / "parameters.json").read_text())) == {"learned", "untrained", "paper"}
 
+    first = tmp_path / "weights.json"
+    run_training(from_mapping(TrainConfig, {**values, "weights": str(first)}), tmp_path / "further")
+    about, before = (json.loads(file.read_text())["about"] for file in (tmp_path / "further" / "weights.json", first))
+    assert about["recipe"]["weights"] == str(first)
+    assert about["began_with"] == before
+    assert "began_with" not in before
+
 
 def test_settings_stored_with_a_run_need_not_be_given_again() -> None:
     for more in ({"tracer": {"_target_": "tagjax.tagattention.TagAttention"}}, {"weights": "default"}):

@@ -129,7 +129,7 @@ def with_named_values(module: ModuleT, values: Mapping[str, float]) -> ModuleT:
 
 
 def learning_only(module: ModuleT, patterns: Sequence[str]) -> ModuleT:
-    """The module in which gradients reach only the scalars whose dotted name one of the patterns matches (`attention.*`).
+    """The module with a gradient for some of its learnable scalars only: those whose dotted names match a pattern (`attention.*`).
 
     Raises `ValueError` for a pattern that matches no name.
     """

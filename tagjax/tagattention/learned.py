@@ -61,6 +61,7 @@ class Learned:
     clips: Mapping[str, Any]  # clip settings of the training: stride, window, flow, estimator, antennas
     parameters: Mapping[str, float]  # in physical units, by dotted name
     default: bool  # whether `default` may mean this file
+    about: Any  # for people: how it was learned
 
     def unmoved(self, began: Mapping[str, Any]) -> set[str]:
         """Parameters that still have the value that learning began from."""
@@ -251,7 +252,7 @@ def _read(path: Path) -> Learned:
     if isinstance(flow := clips.get("flow"), str) and _is_file(path.parent / flow):
         clips["flow"] = str(path.parent / flow)
     parameters = {name: float(value) for name, value in content["parameters"].items()}
-    return Learned(path, content["settings"], content["static"], clips, parameters, default)
+    return Learned(path, content["settings"], content["static"], clips, parameters, default, content.get("about"))
 
 
 def _content(path: Path) -> dict[str, Any]:

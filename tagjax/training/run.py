@@ -21,7 +21,7 @@ from ..recording import Recording
 from ..report.page import PAGE, write_page
 from ..report.report import score_table
 from ..tagattention import TagAttention
-from ..tagattention.learned import LearnableTracer, save_parameters
+from ..tagattention.learned import LearnableTracer, read_learned, save_parameters
 from ..tagattention.tracer_settings import baseline_clips, make_tracer
 from ..tracing.tracer import AbstractTracer
 from .checkpoint import Checkpoints
@@ -201,6 +201,8 @@ def _save_learned(
         recipe = dataclasses.asdict(config) | {"steps": int(state.step)}
         clips = dataclasses.asdict(config.data.clips) | {"flow": flows["learned"]}
         about = to_json_values({"recipe": recipe})
+        if config.weights is not None:
+            about["began_with"] = read_learned(config.weights, config.tracer).about
         save_parameters(folder / "weights.json", learned, config.tracer, to_json_values(clips), about)
     write_json(folder / "parameters.json", {name: parameters(tracer) for name, tracer in tracers.items()})
     return tracers, flows
