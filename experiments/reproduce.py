@@ -1,6 +1,7 @@
 """Make a table of results from its recipe: measure it, write it as JSON and into its pages.
 
 python -m experiments.reproduce table=suites               # interrupted, it resumes when it is started again
+python -m experiments.reproduce table=forerunners          # runs the commands that measure its cells
 python -m experiments.reproduce table=suites confirm=1     # up to date again after a change that alters no score
 python -m experiments.reproduce table=suites render=true   # the Markdown again, from the JSON
 python -m experiments.reproduce check=true                 # which tables are stale, and why
@@ -8,6 +9,10 @@ python -m experiments.reproduce check=true                 # which tables are st
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +38,49 @@ def tracer_settings(name: str) -> dict[str, Any]:
     return plain_values(compose(f"{group}/{name}")[group])
 
 
+def run_command(name: str, overrides: Sequence[str], recordings: Path, folder: Path) -> Any:
+    """The result of `python -m experiments.<name>`, which it prints last. Raises `ValueError` where the command fails."""
+    line = [sys.executable, "-m", f"experiments.{name}", *overrides]
+    settings = ["progress=false", f"paths.recordings_dir={recordings.absolute()}", f"hydra.run.dir={folder}"]
+    done = subprocess.run([*line, *settings], cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        last = (done.stderr or done.stdout).strip().splitlines()[-1:]
+        raise ValueError(f"{' '.join(line[1:])}: exit status {done.returncode}. {' '.join(last)}")
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def _commands_table(recipe: Any, values: Mapping[str, Any], folder: Path, report: Any) -> dict[str, Any]:
+    """A table of other commands' results, whose suites are simulated first where recordings are missing."""
+    from tagjax.core.settings import ConfigError, from_mapping
+    from tagjax.evaluation.reproduce.commands import make_command_table
+    from tagjax.sim.suites import Suite, make_suite
+
+    if values["confirm"] is not None:
+        raise ConfigError(f"confirm is {values['confirm']}; expected null: {recipe.name} has no scores by recording.")
+    recordings = Path(values["recordings_dir"])
+    for name, settings in suites_named(recipe.suites()).items():
+        suite = from_mapping(Suite, settings, where=f"suite {name}")
+        make_suite(suite, recordings, workers=values["workers"], on_progress=report)
+
+    def run(name: str, overrides: Sequence[str]) -> Any:
+        return run_command(name, overrides, recordings, folder / name)
+
+    return make_command_table(recipe, ROOT, run, finished=Path(values["finished_dir"]), on_progress=report)
+
+
 @resumable_command
 def main(values: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
     from tagjax.core.progress import progress_lines
-    from tagjax.core.settings import from_mapping
+    from tagjax.evaluation.reproduce.commands import CommandRecipe, recipe_from
     from tagjax.evaluation.reproduce.markdown import rendered, write_pages
-    from tagjax.evaluation.reproduce.recipe import Recipe
     from tagjax.evaluation.reproduce.status import status
 
     if not (ROOT / "docs").is_dir():
         raise ValueError(f"found no folder docs in {ROOT}; expected a clone of the repository, with its pages.")
     chosen, console = values.get("table"), Console(soft_wrap=True, highlight=False, markup=False)
-    recipes = [from_mapping(Recipe, one, where="table") for one in ([chosen] if chosen else recipe_settings())]
+    recipes = [recipe_from(one) for one in ([chosen] if chosen else recipe_settings())]
     if values["check"]:
         found = [line for recipe in recipes for line in status(recipe, ROOT)]
         console.print(*found or ["Every table is up to date."], sep="\n")
@@ -59,18 +93,22 @@ def main(values: dict[str, Any], folder: Path) -> None:
         raise ValueError(f"found no table; expected table=<name>, one of {', '.join(one.name for one in recipes)}.")
     from tagjax.evaluation.reproduce.make import make_table  # needs the sim extra
 
+    recipe = recipes[0]
     with progress_lines(shown=values["progress"], console=console) as report:
-        table = make_table(
-            recipes[0],
-            ROOT,
-            suites=suites_named(recipes[0].suites()),
-            tracers={name: tracer_settings(name) for name in recipes[0].tracers()},
-            recordings=Path(values["recordings_dir"]),
-            finished=Path(values["finished_dir"]),
-            workers=values["workers"],
-            confirm=values["confirm"],
-            on_progress=report,
-        )
+        if isinstance(recipe, CommandRecipe):
+            table = _commands_table(recipe, values, folder, report)
+        else:
+            table = make_table(
+                recipe,
+                ROOT,
+                suites=suites_named(recipe.suites()),
+                tracers={name: tracer_settings(name) for name in recipe.tracers()},
+                recordings=Path(values["recordings_dir"]),
+                finished=Path(values["finished_dir"]),
+                workers=values["workers"],
+                confirm=values["confirm"],
+                on_progress=report,
+            )
     console.print(rendered(table))
 
 

@@ -22,6 +22,7 @@ from experiments.reproduce import tracer_settings
 from experiments.suites import suites_named
 from tagjax.core.settings import ConfigError, from_mapping
 from tagjax.evaluation.reproduce import measure as measuring
+from tagjax.evaluation.reproduce.commands import CommandRecipe, recipe_from
 from tagjax.evaluation.reproduce.make import make_table
 from tagjax.evaluation.reproduce.markdown import differing, not_made, rendered, replaced, write_pages
 from tagjax.evaluation.reproduce.measure import Inputs, Tracing, measure
@@ -588,10 +589,14 @@ def test_a_table_of_a_simulated_suite_is_made(root: Path, system: dict[str, Any]
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
 def test_every_recipe_names_what_is_there_and_depends_on_it(path: Path):
-    recipe = from_mapping(Recipe, _settings(path), where=f"table {path.stem}")
+    recipe = recipe_from(_settings(path))
     assert recipe.name == path.stem
     files = dependencies(ROOT, recipe.depends)
     assert f"conf/table/{path.name}" in files
+    if isinstance(recipe, CommandRecipe):
+        settings = {f"conf/{one.command}.yaml" for one in recipe.commands.values()}
+        assert {*files} >= settings | {f"conf/suite/{name}.yaml" for name in recipe.suites()}
+        return
     assert {Path(name).stem for name in files} >= {*recipe.suites(), *recipe.tracers()}
     code = [name for name in files if name.startswith("tagjax/")]
     assert {Path(name).parts[1] for name in code} >= {"radio", "flow", "sim", "tracing", "tagattention", "metrics"}
@@ -624,14 +629,14 @@ def test_tables_that_need_the_same_scores_share_them():
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
 def test_every_page_shows_the_table_of_its_json(path: Path):
-    recipe = from_mapping(Recipe, _settings(path), where=f"table {path.stem}")
+    recipe = recipe_from(_settings(path))
     assert differing(recipe, ROOT) == [], f"run `python -m experiments.reproduce table={path.stem} render=true`"
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
 def test_stale_tables_are_reported(path: Path):
     """A stale table is no failure: measuring takes long, and most changes of code change no value."""
-    recipe = from_mapping(Recipe, _settings(path), where=f"table {path.stem}")
+    recipe = recipe_from(_settings(path))
     if reasons := status(recipe, ROOT):
         pytest.xfail(" ".join(reasons))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.files import write_atomic
-from .recipe import COUNTS, Recipe
+from .recipe import COUNTS, TableRecipe
 from .table import command, read_table, table_path
 
 
@@ -18,7 +18,7 @@ def rendered(table: Mapping[str, Any]) -> str:
     columns = table["columns"]
     lines = ["| | " + " | ".join(column["heading"] for column in columns) + " |", "|" + "---|" * (len(columns) + 1)]
     for row in table["rows"]:
-        mark = "" if row["kind"] == "score" else " \\*"
+        mark = " \\*" if row["kind"] == "recorded" else ""
         cells = [_cell(row["cells"][column["name"]], column) for column in columns]
         lines.append("| " + " | ".join([_escaped(row["label"]) + mark, *cells]) + " |")
     notes = [_made_by(table)]
@@ -42,7 +42,7 @@ def replaced(text: str, name: str, body: str) -> str:
     return f"{head}\n{body}\n{tail}"
 
 
-def pages(recipe: Recipe, root: Path) -> dict[Path, tuple[str, str]]:
+def pages(recipe: TableRecipe, root: Path) -> dict[Path, tuple[str, str]]:
     """The present text of each page of a table, and the text according to its JSON. Raises `ValueError` for missing markers."""
     table = read_table(table_path(root, recipe.name))
     body = not_made(recipe.name) if table is None else rendered(table)
@@ -57,12 +57,12 @@ def pages(recipe: Recipe, root: Path) -> dict[Path, tuple[str, str]]:
     return texts
 
 
-def differing(recipe: Recipe, root: Path) -> list[Path]:
+def differing(recipe: TableRecipe, root: Path) -> list[Path]:
     """The pages whose table is not that of the JSON."""
     return [path for path, (before, after) in pages(recipe, root).items() if before != after]
 
 
-def write_pages(recipe: Recipe, root: Path) -> list[Path]:
+def write_pages(recipe: TableRecipe, root: Path) -> list[Path]:
     """Write the table of the JSON into its pages; returns the pages that changed."""
     changed = []
     for path, (before, after) in pages(recipe, root).items():
@@ -86,6 +86,8 @@ def _parts(text: str, name: str) -> tuple[str, str, str]:
 def _cell(cell: Mapping[str, Any] | None, column: Mapping[str, Any]) -> str:
     if cell is None:
         return ""
+    if cell["kind"] == "text":
+        return _escaped(cell["text"])
     if cell["kind"] == "recorded":
         return _escaped(cell["text"] if cell["paper"] is None else f"{cell['text']} ({cell['paper']})")
     parts = []

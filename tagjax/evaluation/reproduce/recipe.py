@@ -2,6 +2,7 @@
 
 A recipe is plain settings (conf/table/<name>.yaml). Nothing in it is executed: what can be measured is a score of a suite
 (`kind: score`), and what cannot be measured from a simulated suite is written by hand with its source (`kind: recorded`).
+What other commands measure has a recipe of its own kind (`CommandRecipe`).
 """
 
 from __future__ import annotations
@@ -131,18 +132,16 @@ class Job:
         return f"{self.suite}/{self.split}{seeds}/{self.protocol}/{self.system}"
 
 
-@dataclasses.dataclass(frozen=True)
-class Recipe:
-    """Everything that determines a table, except for the files in `depends`."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TableRecipe:
+    """What every recipe of a table has."""
 
     name: str
     title: str
     pages: tuple[str, ...]  # files that hold the markers `<!-- table: name -->` and `<!-- /table -->`
-    columns: Mapping[str, Column]
-    rows: tuple[Row, ...]
+    columns: Mapping[str, Any]
+    rows: tuple[Any, ...]
     depends: tuple[str, ...]  # patterns of files (`tagjax/radio/**/*.py`); the table is stale once one of them changes
-    systems: Mapping[str, System] = dataclasses.field(default_factory=dict)
-    protocols: Mapping[str, Protocol] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("pages", "columns", "rows", "depends"):
@@ -151,6 +150,24 @@ class Recipe:
         for path in (*self.pages, *self.depends):
             if PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts:
                 raise ConfigError(f"found {path!r}; expected a path within the repository, from its root.")
+
+    @staticmethod
+    def _check(where: str, found: Any, known: Mapping[str, Any]) -> None:
+        if unknown := [str(name) for name in found if name not in known]:
+            raise ConfigError(f"{where}: found {', '.join(unknown)}; expected some of {', '.join(known) or 'none'}.")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recipe(TableRecipe):
+    """Everything that determines a table of scores, except for the files in `depends`."""
+
+    columns: Mapping[str, Column]
+    rows: tuple[Row, ...]
+    systems: Mapping[str, System] = dataclasses.field(default_factory=dict)
+    protocols: Mapping[str, Protocol] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         for row in self.rows:
             self._check(f"row {row.label!r}: recorded", row.recorded, self.columns)
             if row.kind == "score":
@@ -159,11 +176,6 @@ class Recipe:
                 self._check(f"row {row.label!r}: system", by_column, self.columns)
                 systems = by_column.values() if by_column else [row.system] if row.system else []
                 self._check(f"row {row.label!r}: system", systems, self.systems)
-
-    @staticmethod
-    def _check(where: str, found: Any, known: Mapping[str, Any]) -> None:
-        if unknown := [str(name) for name in found if name not in known]:
-            raise ConfigError(f"{where}: found {', '.join(unknown)}; expected some of {', '.join(known) or 'none'}.")
 
     def job(self, row: Row, column: str) -> Job | None:
         """The measurement for the cell of a row and a column; None for a recorded or an empty cell."""

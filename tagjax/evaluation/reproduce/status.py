@@ -6,14 +6,14 @@ from pathlib import Path
 
 from .markdown import differing
 from .provenance import changes, dependencies
-from .recipe import Recipe
+from .recipe import TableRecipe
 from .table import command, read_table, table_path
 
 _MAX_LISTED = 5
 """Up to this many changed files are listed; of the others only the number is given."""
 
 
-def stale(recipe: Recipe, root: Path) -> list[str]:
+def stale(recipe: TableRecipe, root: Path) -> list[str]:
     """Why a table must be made again: it was never made, or which files changed. Empty for a table that is up to date."""
     table = read_table(table_path(root, recipe.name))
     if table is None:
@@ -21,7 +21,7 @@ def stale(recipe: Recipe, root: Path) -> list[str]:
     return changes(table["depends"], dependencies(root, recipe.depends))
 
 
-def status(recipe: Recipe, root: Path) -> list[str]:
+def status(recipe: TableRecipe, root: Path) -> list[str]:
     """Problems of a table and what to do, one line each; empty where there is none."""
     problems = []
     if reasons := stale(recipe, root):

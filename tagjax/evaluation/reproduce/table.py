@@ -15,7 +15,7 @@ from ...core.machine import machine
 from ...core.results import write_json
 from ...metrics.interval import LEVEL, NUM_RESAMPLES, SEED, ratio_estimate
 from .provenance import dependencies, revision
-from .recipe import COUNTS, Column, Job, Recipe, Row
+from .recipe import COUNTS, Column, Job, Recipe, Row, TableRecipe
 from .scores import RecordingScores
 
 FORMAT, VERSION = "tagjax-table", 1
@@ -31,7 +31,7 @@ def table_path(root: Path, name: str) -> Path:
     return root / "docs" / "tables" / f"{name}.json"
 
 
-def begin(recipe: Recipe, root: Path) -> dict[str, Any]:
+def begin(recipe: TableRecipe, root: Path) -> dict[str, Any]:
     """The metadata of a table before it is measured: name, command, revision, date, machine, and files it depends on."""
     files = dependencies(root, recipe.depends)
     return {
