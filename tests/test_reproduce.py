@@ -426,6 +426,18 @@ def test_confirming_traces_all_recordings_once_one_scores_otherwise(tmp_path: Pa
     assert len(traced) == 4
 
 
+def test_confirming_traces_all_recordings_once_a_setting_changed(tmp_path: Path, traced: list[Path]):
+    """Even where the first of them score as before: others may not."""
+    before = _whole_table(tmp_path, traced)
+    changed = _recipe(systems={"online": {"tracer": "tagattention_literal", "clips": {"stride": 4}}})
+    measure(changed, _inputs(tmp_path), before=before, confirm=1)
+    assert len(traced) == 4
+    unknown = {job: [dataclasses.replace(one, settings=None) for one in scores] for job, scores in before.items()}
+    traced.clear()
+    measure(_recipe(), _inputs(tmp_path, code=CHANGED_CODE), before=unknown, confirm=1)
+    assert len(traced) == 4
+
+
 def test_confirming_traces_all_recordings_of_a_new_row(tmp_path: Path, traced: list[Path]):
     measure(_recipe(), _inputs(tmp_path), before={}, confirm=1)
     assert len(traced) == 4

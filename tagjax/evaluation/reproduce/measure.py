@@ -57,7 +57,8 @@ def measure(
 
     Recordings that were traced before, by the same code with the same settings, are not traced again; an interruption
     loses only the recording in progress. With `confirm`, the first so many recordings of each job are traced; where they
-    score as in `before` (by the job's name), the scores of the others are taken from there. Raises `ConfigError` for a
+    score as in `before` (by the job's name), the scores of the others are taken from there, if only the code has changed since
+    and no setting or parameter. Raises `ConfigError` for a
     suite or tracer that is not in `inputs`, for a split without recordings, and for `confirm` below 1.
     """
     if confirm is not None and confirm < 1:
@@ -74,7 +75,8 @@ def measure(
             for job in (job for job in jobs if _recordings_key(job) == draw):
                 on_progress("trace", next(numbers), total, f"{item.name}: {job.system}")
                 known = earlier[job].get(item.name)
-                if known is None or confirm is None or position < confirm:
+                same = known is not None and known.settings == tracings[job].settings_hash(item)
+                if known is None or not same or confirm is None or position < confirm:
                     found = tracings[job].scores(item, inputs)
                     if known is None or not found.same_as(known, SCORES):
                         earlier[job] = {}  # the code scores otherwise than before: nothing of this job is taken over
@@ -98,13 +100,16 @@ class Tracing:
     def scores(self, item: Item, inputs: Inputs) -> RecordingScores:
         """The scores of a recording, which is traced unless they are stored already."""
         follows_from = self.determinants(item, inputs.code)
-        name = hashlib.sha256(json.dumps(follows_from, sort_keys=True).encode()).hexdigest()[:24]
-        path = inputs.finished / f"{name}.json"
+        path = inputs.finished / f"{_hash(follows_from)}.json"
         kept = _stored(path, follows_from)
         if kept is None:
             kept = RecordingScores.of(self.trace(item.path(inputs.recordings)), inputs.revision)
             write_json(path, {"follows_from": follows_from, "scores": dataclasses.asdict(kept)})
-        return kept
+        return dataclasses.replace(kept, settings=self.settings_hash(item))
+
+    def settings_hash(self, item: Item) -> str:
+        """A hash of all that determines the scores but the code."""
+        return _hash(self.determinants(item, {}))
 
     def trace(self, path: Path) -> RecordingResult:
         """Trace and score the recording at `path`."""
@@ -190,6 +195,10 @@ def _settings_by_name(kind: str, name: str, known: Mapping[str, Mapping[str, Any
     if name not in known:
         raise ConfigError(f"found {kind} {name!r}; expected one of {', '.join(known) or 'none'}.")
     return known[name]
+
+
+def _hash(values: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
 
 
 def _stored(path: Path, follows_from: Mapping[str, Any]) -> RecordingScores | None:

@@ -24,6 +24,7 @@ class RecordingScores:
     num_frames: int
     sums: Mapping[str, tuple[float, int]]
     revision: str | None = None  # Git's commit when it was traced, if known
+    settings: str | None = None  # a hash of the settings and parameters with which it was traced, if known
 
     @classmethod
     def of(cls, result: RecordingResult, revision: str | None = None) -> RecordingScores:
@@ -42,7 +43,8 @@ class RecordingScores:
         """
         sums = {name: (float(total), int(count)) for name, (total, count) in content["sums"].items()}
         num_tags, num_frames = int(content["num_tags"]), int(content["num_frames"])
-        return cls(content["name"], num_tags, num_frames, sums, content.get("revision") or revision)
+        known = content.get("revision") or revision
+        return cls(content["name"], num_tags, num_frames, sums, known, content.get("settings"))
 
     def same_as(self, other: RecordingScores, measures: Iterable[str]) -> bool:
         """Whether both are of one recording, with the same counts and the same means (`TOLERANCE`) of these measures."""
