@@ -16,6 +16,8 @@ from tagjax.evaluation.reproduce.status import stale, status
 RESULTS: dict[str, Any] = {
     "one": {
         "paper": {"error_mm": 10.33},
+        "mean": {"value": 0.7, "low": 0.651, "high": 0.75, "count": 30},
+        "one": {"value": 0.4, "low": None, "high": None, "count": 30},
         "parts": [{"name": "a", "num": 2, "iou": 0.7}, {"name": "b", "num": 2, "iou": None}],
     }
 }
@@ -67,6 +69,7 @@ class Runs:
         ("{one/paper/error_mm}", "10.33"),
         ("{one/parts/0/name}: {one/parts/name=a,num=2/iou:.0%}", "a: 70 %"),
         ("{{as it is}}", "{as it is}"),
+        ("{one/mean:.2f}, {one/one:.1%}", "0.70 [0.65, 0.75], 40.0 %"),
     ],
 )
 def test_values_stand_in_the_text(text: str, shown: str) -> None:

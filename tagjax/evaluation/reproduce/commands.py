@@ -2,7 +2,7 @@
 
 A command's result is the JSON that it prints last. A cell is a text in which `{command/path:format}` stands for a value of it:
 `{tagvision/calibration/one_place/transform_error_mm:.2f} mm`. The path leads through objects by name, and through lists by number, or by the
-values that the wanted object has (`{compare/suite=multi_4,system=blobs/iou:.2f}`). The recipe names commands from a fixed list;
+values that the wanted object has (`{compare/suite=multi_4,system=blobs/iou:.2f}`). An estimate is shown with its interval. The recipe names commands from a fixed list;
 nothing else in it is executed.
 """
 
@@ -139,13 +139,20 @@ def filled_in(text: str, results: Mapping[str, Any]) -> str:
     for before, path, form in _parts(text):
         filled.append(before)
         if path:
-            value = _at(results, path)
-            try:
-                shown = format(value, form)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{'/'.join(path)}: found {value!r}, which has no format {form!r}.") from error
-            filled.append(f"{shown[:-1]} %" if form.endswith("%") else shown)
+            filled.append(_shown(_at(results, path), form, path))
     return "".join(filled)
+
+
+def _shown(value: Any, form: str, path: Sequence[str]) -> str:
+    """A value, or an estimate with its interval, in a format."""
+    if isinstance(value, Mapping):
+        interval = [_shown(value[name], form, path) for name in ("low", "high") if value[name] is not None]
+        return _shown(value["value"], form, path) + (f" [{', '.join(interval)}]" if interval else "")
+    try:
+        shown = format(value, form)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{'/'.join(path)}: found {value!r}, which has no format {form!r}.") from error
+    return f"{shown[:-1]} %" if form.endswith("%") else shown
 
 
 def _parts(text: str) -> Iterator[tuple[str, list[str], str]]:
@@ -158,7 +165,7 @@ def _parts(text: str) -> Iterator[tuple[str, list[str], str]]:
 
 
 def _at(results: Any, path: Sequence[str]) -> Any:
-    """The value to which the path leads."""
+    """The value, or the estimate, to which the path leads."""
     found = results
     for number, step in enumerate(path):
         try:
@@ -174,7 +181,7 @@ def _at(results: Any, path: Sequence[str]) -> Any:
             raise ValueError(
                 f"{'/'.join(path)}: found no {step} in {'/'.join(path[:number]) or 'the results'}; expected one of: {there[:300]}."
             ) from error
-    if isinstance(found, Mapping | list):
+    if isinstance(found, list) or (isinstance(found, Mapping) and not {"value", "low", "high"} <= found.keys()):
         raise ValueError(f"{'/'.join(path)}: found several values; expected the path of one.")
     return found
 
