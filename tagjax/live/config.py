@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class StreamConfig(SensorSettings):
     flow: str = "dis_live"
     stride: int | None = None  # None: that of the tracer's settings, or else of the picture's width
     num_places: int = 4  # for tags, before more are made
-    antennas: tuple[int, ...] | None = None  # ports whose reads are used; None: all
+    antennas: tuple[int, ...] | Literal["all"] = "all"  # ports whose reads are used
     replay: ReplaySettings = dataclasses.field(default_factory=ReplaySettings)
     camera: CameraKind | None = None
     reader: ReaderKind | None = None
@@ -119,7 +119,5 @@ def open_source(config: StreamConfig, stack: contextlib.ExitStack) -> Source:
 
 def _antennas(config: StreamConfig, played: Recording | None) -> tuple[int, ...]:
     if played is not None:
-        return choose_antennas(
-            played, selected_tags(played, None), "all" if config.antennas is None else config.antennas
-        )
-    return config.inventory.antennas if config.antennas is None else config.antennas
+        return choose_antennas(played, selected_tags(played, None), config.antennas)
+    return config.inventory.antennas if config.antennas == "all" else config.antennas
