@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +38,14 @@ def tracer_settings(name: str) -> dict[str, Any]:
     return plain_values(compose(f"{group}/{name}")[group])
 
 
-def run_command(name: str, overrides: Sequence[str], recordings: Path, folder: Path) -> Any:
-    """The result of `python -m experiments.<name>`, which it prints last. Raises `ValueError` where the command fails."""
-    line = [sys.executable, "-m", f"experiments.{name}", *overrides]
+def run_command(command: Any, recordings: Path, folder: Path) -> Any:
+    """The result of a command of `experiments`, which it prints last. Raises `ValueError` where the command fails."""
+    line = [sys.executable, "-m", f"experiments.{command.command}", *command.overrides]
     settings = ["progress=false", f"paths.recordings_dir={recordings.absolute()}", f"hydra.run.dir={folder}"]
     done = subprocess.run([*line, *settings], cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
         last = (done.stderr or done.stdout).strip().splitlines()[-1:]
-        raise ValueError(f"{' '.join(line[1:])}: exit status {done.returncode}. {' '.join(last)}")
+        raise ValueError(f"{command.line}: exit status {done.returncode}. {' '.join(last)}")
     return json.loads(done.stdout.strip().splitlines()[-1])
 
 
@@ -62,8 +62,8 @@ def _commands_table(recipe: Any, values: Mapping[str, Any], folder: Path, report
         suite = from_mapping(Suite, settings, where=f"suite {name}")
         make_suite(suite, recordings, workers=values["workers"], on_progress=report)
 
-    def run(name: str, overrides: Sequence[str]) -> Any:
-        return run_command(name, overrides, recordings, folder / name)
+    def run(name: str, command: Any) -> Any:
+        return run_command(command, recordings, folder / name)
 
     return make_command_table(recipe, ROOT, run, finished=Path(values["finished_dir"]), on_progress=report)
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from experiments.reproduce import run_command
 from tagjax.core.settings import ConfigError, from_mapping
-from tagjax.evaluation.reproduce.commands import CommandRecipe, filled_in, make_command_table
+from tagjax.evaluation.reproduce.commands import Command, CommandRecipe, filled_in, make_command_table
 from tagjax.evaluation.reproduce.markdown import not_made
 from tagjax.evaluation.reproduce.status import stale, status
 
@@ -56,8 +56,8 @@ class Runs:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def __call__(self, name: str, overrides: Sequence[str]) -> Any:
-        self.lines.append(" ".join([name, *overrides]))
+    def __call__(self, name: str, command: Command) -> Any:
+        self.lines.append(f"{name}: {command.line}")
         return {"error_mm": 5.194, "num": 24, "found": 0.0719, "several": [1]}
 
 
@@ -80,9 +80,9 @@ def test_values_stand_in_the_text(text: str, shown: str) -> None:
     ("text", "message"),
     [
         ("{one/paper/error}", r"one/paper/error: found no error in one/paper; expected one of: error_mm\."),
-        ("{one/parts/7/name}", r"found no 7 in one/parts; expected one of: 2 of them\."),
+        ("{one/parts/7/name}", r"found no 7 in one/parts; expected one of 2, by number or values\."),
         ("{one/parts/num=2/name}", r"found no num=2 in one/parts"),
-        ("{one/paper/error_mm/x}", r"found no x in one/paper/error_mm; expected one of: 10\.33\."),
+        ("{one/paper/error_mm/x}", r"found no x in one/paper/error_mm; expected no further step, for it is 10\.33\."),
         ("{one/paper}", r"one/paper: found several values; expected the path of one\."),
         ("{one/parts/1/iou:.2f}", r"one/parts/1/iou: found None, which has no format '\.2f'\."),
         ("{one/paper", r"expected values in braces"),
@@ -98,7 +98,10 @@ def test_a_table_of_commands_is_made_and_goes_stale(root: Path, tmp_path: Path) 
     recipe, runs = _recipe(), Runs()
     assert recipe.suites() == ["planar_tracks"]
     make_command_table(recipe, root, runs, finished=tmp_path / "finished")
-    assert runs.lines == ["tagvision suite=planar_tracks", "tagvision"]
+    assert runs.lines == [
+        "tracks: python -m experiments.tagvision suite=planar_tracks",
+        "lines: python -m experiments.tagvision",
+    ]
     page = (root / "page.md").read_text()
     assert [line for line in page.splitlines() if line.startswith("|")] == [
         "| | measure | here |",
@@ -121,17 +124,17 @@ def test_a_table_of_commands_is_made_and_goes_stale(root: Path, tmp_path: Path) 
 def test_a_failure_loses_nothing_that_was_measured(root: Path, tmp_path: Path) -> None:
     done = Runs()
 
-    def run(name: str, overrides: Sequence[str]) -> Any:
-        if not overrides:
+    def run(name: str, command: Command) -> Any:
+        if name == "lines":
             raise ValueError("experiments.tagvision: exit status 1. no such suite")
-        return done(name, overrides)
+        return done(name, command)
 
     with pytest.raises(ValueError, match="exit status 1"):
         make_command_table(_recipe(), root, run, finished=tmp_path / "finished")
     assert not (root / "docs").exists()
     again = Runs()
     make_command_table(_recipe(), root, again, finished=tmp_path / "finished")
-    assert again.lines == ["tagvision"]
+    assert again.lines == ["lines: python -m experiments.tagvision"]
 
 
 @pytest.mark.parametrize(
@@ -149,3 +152,16 @@ def test_a_failure_loses_nothing_that_was_measured(root: Path, tmp_path: Path) -
 def test_a_wrong_recipe_is_refused(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         _recipe(**changed)
+
+
+@pytest.mark.ci
+def test_a_command_is_run_and_its_last_line_is_the_result(tmp_path: Path) -> None:
+    few = Command("tagvision", ("lines=[]", "num_calibrations=1"))
+    found = run_command(few, tmp_path / "recordings", tmp_path / "run")
+    assert found["paper"]["blob_matching"] == 0.98
+    assert found["calibration"]["one_place"]["transform_error_mm"] > 0
+    wrong = Command("tagvision", ("num_calibrations=0",))
+    with pytest.raises(
+        ValueError, match=r"experiments\.tagvision num_calibrations=0: exit status 1\..*num_calibrations"
+    ):
+        run_command(wrong, tmp_path / "recordings", tmp_path / "run")

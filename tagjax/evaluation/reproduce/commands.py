@@ -25,9 +25,6 @@ from .table import begin, table_path, write_table
 
 Name = Literal["tagvision", "tagview", "goller", "compare", "reads_ceiling", "error_budget", "evaluate_flow"]
 
-RunCommand = Callable[[str, Sequence[str]], Any]
-"""Runs `python -m experiments.<name> <overrides>` and returns its result. Raises `ValueError` where the command fails."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Command:
@@ -46,6 +43,10 @@ class Command:
     def line(self) -> str:
         """As it is typed."""
         return " ".join([f"python -m experiments.{self.command}", *self.overrides])
+
+
+RunCommand = Callable[[str, Command], Any]
+"""Runs a command, of which the recipe's name comes first, and returns its result. Raises `ValueError` where it fails."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +95,7 @@ def make_command_table(
     results = {}
     for number, (name, command) in enumerate(recipe.commands.items()):
         on_progress("command", number, len(recipe.commands), command.line)
-        results[name] = _result(command, run, begun["depends"], finished)
+        results[name] = _result(name, command, run, begun["depends"], finished)
     on_progress("command", len(recipe.commands), len(recipe.commands))
     columns = [
         {"name": name, "heading": heading, "measures": [], "interval": False}
@@ -108,7 +109,7 @@ def make_command_table(
     return table
 
 
-def _result(command: Command, run: RunCommand, code: Mapping[str, str], finished: Path) -> Any:
+def _result(name: str, command: Command, run: RunCommand, code: Mapping[str, str], finished: Path) -> Any:
     """The command's result, stored or measured."""
     follows_from = {"command": command.line, "code": dict(code)}
     path = finished / f"{hashlib.sha256(json.dumps(follows_from, sort_keys=True).encode()).hexdigest()[:24]}.json"
@@ -118,7 +119,7 @@ def _result(command: Command, run: RunCommand, code: Mapping[str, str], finished
             return kept["result"]
     except (OSError, ValueError, KeyError, TypeError):
         pass  # not measured yet, or damaged: it is measured again
-    result = to_json_values(run(command.command, command.overrides))
+    result = to_json_values(run(name, command))
     write_json(path, {"follows_from": follows_from, "result": result})
     return result
 
@@ -171,19 +172,23 @@ def _at(results: Any, path: Sequence[str]) -> Any:
         try:
             found = _below(found, step)
         except (KeyError, IndexError, ValueError, TypeError) as error:
-            there = (
-                ", ".join(map(str, found))
-                if isinstance(found, Mapping)
-                else f"{len(found)} of them"
-                if isinstance(found, list)
-                else repr(found)
-            )
             raise ValueError(
-                f"{'/'.join(path)}: found no {step} in {'/'.join(path[:number]) or 'the results'}; expected one of: {there[:300]}."
+                f"{'/'.join(path)}: found no {step} in {'/'.join(path[:number]) or 'the results'}; expected {_choice(found)}."
             ) from error
     if isinstance(found, list) or (isinstance(found, Mapping) and not {"value", "low", "high"} <= found.keys()):
         raise ValueError(f"{'/'.join(path)}: found several values; expected the path of one.")
     return found
+
+
+def _choice(found: Any) -> str:
+    """What can be named in it."""
+    if isinstance(found, Mapping):
+        return f"one of: {', '.join(map(str, found))[:300]}"
+    return (
+        f"one of {len(found)}, by number or values"
+        if isinstance(found, list)
+        else f"no further step, for it is {found!r}"
+    )
 
 
 def _below(found: Any, step: str) -> Any:
