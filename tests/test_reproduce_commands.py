@@ -110,6 +110,7 @@ def test_a_table_of_commands_is_made_and_goes_stale(root: Path, tmp_path: Path) 
         "|  |  | 7.2 % |",
     ]
     assert "Made by `python -m experiments.reproduce table=small`" in page
+    assert "It runs `python -m experiments.tagvision suite=planar_tracks`, `python -m experiments.tagvision`." in page
     assert status(recipe, root) == []
 
     make_command_table(recipe, root, runs, finished=tmp_path / "finished")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,7 +43,7 @@ class Command:
     @property
     def line(self) -> str:
         """As it is typed."""
-        return " ".join([f"python -m experiments.{self.command}", *self.overrides])
+        return shlex.join(["python", "-m", f"experiments.{self.command}", *self.overrides])
 
 
 RunCommand = Callable[[str, Command], Any]

@@ -14,7 +14,7 @@ from .table import command, read_table, table_path
 
 
 def rendered(table: Mapping[str, Any]) -> str:
-    """The table, and below it its command, revision, date and machine, and the sources of values recorded by hand."""
+    """The table, and below it its command, revision, date and machine, what it runs, and the sources of values recorded by hand."""
     columns = table["columns"]
     lines = ["| | " + " | ".join(column["heading"] for column in columns) + " |", "|" + "---|" * (len(columns) + 1)]
     for row in table["rows"]:
@@ -27,6 +27,8 @@ def rendered(table: Mapping[str, Any]) -> str:
         notes.append(
             f"Square brackets: {interval['level']:.0%} interval by recording ({interval['num_resamples']:,} bootstrap resamples)."
         )
+    if commands := table.get("commands"):
+        notes.append(f"It runs {', '.join(f'`{line}`' for line in commands.values())}.")
     notes += _recorded_notes(table)
     return "\n".join(lines) + "\n\n" + " ".join(notes)
 
