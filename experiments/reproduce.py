@@ -50,7 +50,7 @@ def run_command(command: Any, recordings: Path, folder: Path) -> Any:
 
 
 def _commands_table(recipe: Any, values: Mapping[str, Any], folder: Path, report: Any) -> dict[str, Any]:
-    """A table of other commands' results, whose suites are simulated first where recordings are missing."""
+    """Make a table of what other commands measure. Recordings of its suites that are missing are simulated first."""
     from tagjax.core.settings import ConfigError, from_mapping
     from tagjax.evaluation.reproduce.commands import make_command_table
     from tagjax.sim.suites import Suite, make_suite

@@ -9,8 +9,6 @@ nothing else in it is executed.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import shlex
 import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,8 +16,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ...core.progress import OnProgress, unobserved
-from ...core.results import to_json_values, write_json
+from ...core.results import to_json_values
 from ...core.settings import ConfigError, from_mapping
+from .finished import store, stored
 from .markdown import write_pages
 from .recipe import Recipe, TableRecipe
 from .table import begin, table_path, write_table
@@ -90,7 +89,7 @@ def make_command_table(
     """Run the commands, write the table to docs/tables below `root` and into its pages, and return it.
 
     Results are stored in `finished`: after an interruption only commands without one are run. Raises `ValueError` where a
-    command fails, and for a cell whose path leads nowhere.
+    command fails, and for a cell that names a value which the results do not have.
     """
     begun = begin(recipe, root)
     results = {}
@@ -113,15 +112,10 @@ def make_command_table(
 def _result(name: str, command: Command, run: RunCommand, code: Mapping[str, str], finished: Path) -> Any:
     """The command's result, stored or measured."""
     follows_from = {"command": command.line, "code": dict(code)}
-    path = finished / f"{hashlib.sha256(json.dumps(follows_from, sort_keys=True).encode()).hexdigest()[:24]}.json"
-    try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept["follows_from"] == follows_from:
-            return kept["result"]
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # not measured yet, or damaged: it is measured again
-    result = to_json_values(run(name, command))
-    write_json(path, {"follows_from": follows_from, "result": result})
+    result = stored(finished, follows_from, lambda kept: kept)
+    if result is None:
+        result = to_json_values(run(name, command))
+        store(finished, follows_from, result)
     return result
 
 

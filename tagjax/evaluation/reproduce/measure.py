@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +13,7 @@ from ...baselines import AbstractHostTracer, host_trace
 from ...baselines.blobs import BlobSettings, BlobTracer
 from ...core.camera import working_stride
 from ...core.progress import OnProgress, unobserved
-from ...core.results import to_json_values, write_json
+from ...core.results import to_json_values
 from ...core.settings import ConfigError, changed, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording, score_traces
 from ...recording.store import open_recording
@@ -23,6 +22,7 @@ from ...tagattention.tracer_settings import learned_tracer, make_tracer, settled
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
 from ...training.evaluate import parameters
+from .finished import hash_of, store, stored
 from .recipe import SCORES, Job, Recipe
 from .scores import RecordingScores
 
@@ -75,8 +75,12 @@ def measure(
             for job in (job for job in jobs if _recordings_key(job) == draw):
                 on_progress("trace", next(numbers), total, f"{item.name}: {job.system}")
                 known = earlier[job].get(item.name)
-                same = known is not None and known.settings == tracings[job].settings_hash(item)
-                if known is None or not same or confirm is None or position < confirm:
+                if (
+                    known is None
+                    or confirm is None
+                    or position < confirm
+                    or known.settings != tracings[job].settings_hash(item)
+                ):
                     found = tracings[job].scores(item, inputs)
                     if known is None or not found.same_as(known, SCORES):
                         earlier[job] = {}  # the code scores otherwise than before: nothing of this job is taken over
@@ -100,16 +104,15 @@ class Tracing:
     def scores(self, item: Item, inputs: Inputs) -> RecordingScores:
         """The scores of a recording, which is traced unless they are stored already."""
         follows_from = self.determinants(item, inputs.code)
-        path = inputs.finished / f"{_hash(follows_from)}.json"
-        kept = _stored(path, follows_from)
+        kept = stored(inputs.finished, follows_from, RecordingScores.from_json)
         if kept is None:
             kept = RecordingScores.of(self.trace(item.path(inputs.recordings)), inputs.revision)
-            write_json(path, {"follows_from": follows_from, "scores": dataclasses.asdict(kept)})
+            store(inputs.finished, follows_from, dataclasses.asdict(kept))
         return dataclasses.replace(kept, settings=self.settings_hash(item))
 
     def settings_hash(self, item: Item) -> str:
         """A hash of all that determines the scores but the code."""
-        return _hash(self.determinants(item, {}))
+        return hash_of(self.determinants(item, {}))
 
     def trace(self, path: Path) -> RecordingResult:
         """Trace and score the recording at `path`."""
@@ -195,18 +198,3 @@ def _settings_by_name(kind: str, name: str, known: Mapping[str, Mapping[str, Any
     if name not in known:
         raise ConfigError(f"found {kind} {name!r}; expected one of {', '.join(known) or 'none'}.")
     return known[name]
-
-
-def _hash(values: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def _stored(path: Path, follows_from: Mapping[str, Any]) -> RecordingScores | None:
-    """Stored scores; None where there are none or the file is damaged, so that they are measured again."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["follows_from"] != follows_from:
-            return None
-        return RecordingScores.from_json(content["scores"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
