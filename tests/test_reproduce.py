@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import re
 import subprocess
 import sys
+import tokenize
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from tagjax.evaluation.reproduce.commands import CommandRecipe, recipe_from
 from tagjax.evaluation.reproduce.make import make_table
 from tagjax.evaluation.reproduce.markdown import differing, not_made, rendered, replaced, write_pages
 from tagjax.evaluation.reproduce.measure import Inputs, Tracing, measure
-from tagjax.evaluation.reproduce.provenance import blob_id, changes, dependencies, revision
+from tagjax.evaluation.reproduce.provenance import _code, changes, content_id, dependencies, revision
 from tagjax.evaluation.reproduce.recipe import COUNTS, MEASURES, Job, Recipe
 from tagjax.evaluation.reproduce.scores import RecordingScores
 from tagjax.evaluation.reproduce.status import stale, status
@@ -167,9 +169,56 @@ def test_frames_count_the_same_and_recordings_without_any_are_left_out():
 # Files that a table follows from
 
 
-def test_blob_ids_are_those_of_git():
-    assert blob_id(b"") == "e69de29bb2d1d6434b8b29ae775ad8c2e48c5391"
-    assert blob_id(b"hello\n") == "ce013625030ba8dba906f756967f9e9ca394464a"
+PROSE = '''"""A module."""  # why
+
+SIZE = "# not a comment"  # pixels
+"""Of an image."""
+
+
+def area(a: int) -> int:
+    """The area.
+
+    Of a square.
+    """
+    # The side, twice.
+
+    text = """
+        kept
+    """
+    return a * a if text else 0
+'''
+CODE = '''
+SIZE = "# not a comment"
+def area(a: int) -> int:
+    text = """
+        kept
+    """
+    return a * a if text else 0
+'''
+
+
+def test_prose_does_not_change_the_id_of_a_file(tmp_path: Path):
+    def named(text: str, name: str = "one.py") -> str:
+        (tmp_path / name).write_text(text)
+        return content_id(tmp_path / name)
+
+    assert named(PROSE) == named(CODE)
+    assert named(PROSE) != named(PROSE.replace("a * a", "a + a"))
+    assert named(PROSE) != named(PROSE.replace("        kept", "        other"))
+    assert named(PROSE) != named(PROSE.replace("not a comment", "another text"))
+    assert named("a: {b: 1}  # why\n", "one.yaml") == named("# what\na:\n  b: 1\n", "one.yaml")
+    assert named("a: {b: 1}\n", "one.yaml") != named("a: {b: 2}\n", "one.yaml")
+    assert named(PROSE, "one.md") != named(CODE, "one.md")
+
+
+def test_only_prose_is_cut_from_what_is_hashed():
+    def code_tokens(source: str) -> list[str]:
+        kinds = (tokenize.NAME, tokenize.OP, tokenize.NUMBER)
+        return [one.string for one in tokenize.generate_tokens(io.StringIO(source).readline) if one.type in kinds]
+
+    for path in sorted((ROOT / "tagjax").rglob("*.py")):
+        source = path.read_text()
+        assert code_tokens(_code(source)) == code_tokens(source), path
 
 
 def test_changes_are_named(root: Path):

@@ -40,7 +40,7 @@ class Inputs:
     tracers: Mapping[str, Mapping[str, Any]]
     recordings: Path  # folder of the suites' recordings; missing ones are simulated
     finished: Path  # folder of the scores of traced recordings, by the hash of what determines them
-    code: Mapping[str, str]  # blob ids of the files that determine the scores
+    code: Mapping[str, str]  # ids of the files that determine the scores
     workers: int = 1  # processes that simulate
     revision: str | None = None  # Git's commit of that code
 

@@ -2,20 +2,44 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
+import io
+import json
 import subprocess
+import tokenize
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
 
-def blob_id(content: bytes) -> str:
-    """Git's id of a file with this content (`git hash-object`)."""
-    return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+
+def content_id(path: Path) -> str:
+    """SHA-1 of a file. Of Python without comments, docstrings and empty lines, and of what YAML says: figures follow from no prose."""
+    content = path.read_bytes()
+    if path.suffix == ".py":
+        content = _code(content.decode()).encode()
+    elif path.suffix == ".yaml":
+        content = json.dumps(yaml.safe_load(content)).encode()
+    return hashlib.sha1(content, usedforsecurity=False).hexdigest()
+
+
+def _code(source: str) -> str:
+    """The lines of Python that hold code, without comments. The same under every version of Python."""
+    lines = source.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            lines[node.lineno - 1 : node.end_lineno] = [""] * (node.end_lineno - node.lineno + 1)
+    return "\n".join(line.rstrip() for line in lines if line.strip())
 
 
 def dependencies(root: Path, patterns: Iterable[str]) -> dict[str, str]:
-    """The blob ids of the files that the patterns match below `root`, by path from there.
+    """The ids (`content_id`) of the files that the patterns match below `root`, by path from there.
 
     Raises `ValueError` for a pattern that matches none: otherwise a change of that file would not be detected.
     """
@@ -26,12 +50,12 @@ def dependencies(root: Path, patterns: Iterable[str]) -> dict[str, str]:
             raise ValueError(
                 f"depends: {pattern!r} matches no file in {root}; correct it or take it out of the recipe."
             )
-        files |= {path.relative_to(root).as_posix(): blob_id(path.read_bytes()) for path in paths}
+        files |= {path.relative_to(root).as_posix(): content_id(path) for path in paths}
     return dict(sorted(files.items()))
 
 
 def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Why a table is stale: each file with another blob id, and each added or removed file."""
+    """Why a table is stale: each file with another id, and each added or removed file."""
     words = {(True, True): "changed", (True, False): "removed", (False, True): "added"}
     return [
         f"{path} ({words[path in before, path in now]})"
@@ -40,18 +64,17 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     ]
 
 
-def revision(root: Path, files: Mapping[str, str]) -> dict[str, Any]:
-    """The current Git commit, and which of the files differ from it (None outside of a repository).
+def revision(root: Path, files: Iterable[str]) -> dict[str, Any]:
+    """The current Git commit, and which of the files (paths from `root`) differ from it (None outside of a repository).
 
     Other files are ignored, so that a table written before does not count as a change.
     """
     commit = _git(root, "rev-parse", "HEAD")
-    listed = None if commit is None else _git(root, "ls-tree", "-r", "-z", "--full-tree", "HEAD")
-    if commit is None or listed is None:
+    changed = _git(root, "diff", "--name-only", "--relative", "-z", "HEAD")
+    new = _git(root, "ls-files", "--others", "-z")
+    if commit is None or changed is None or new is None:
         return {"commit": None, "dirty": None, "modified": []}
-    lines = (line.partition("\t") for line in listed.split("\0") if line)
-    committed = {path: about.split()[2] for about, _, path in lines}
-    modified = [path for path, content in files.items() if committed.get(path) != content]
+    modified = sorted({*changed.split("\0"), *new.split("\0")}.intersection(files))
     return {"commit": commit.strip(), "dirty": bool(modified), "modified": modified}
 
 
