@@ -24,6 +24,7 @@ from tagjax.metrics.flow import FlowScores, endpoint_error, warped_error
 from tagjax.recording import RecordingError, Truth
 from tagjax.recording.store import save_recording
 from tagjax.report.flow import colour_wheel, error_colours, flow_colours
+from tagjax.report.flow_speed import error_by_time
 from tagjax.sim.flow_pairs import FlowPairSettings
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -299,6 +300,19 @@ def test_scores_before_a_case_that_fails_are_kept_and_called_unfinished(scenes, 
     assert not (tmp_path / "nothing").exists()
 
 
+def test_errors_are_drawn_against_times_where_both_are_known(tmp_path):
+    def scores(error_px: float | None, ms: float | None) -> dict[str, dict[str, float | None]]:
+        return {"all": {"epe_moving_px": error_px, "median_ms": ms}}
+
+    flows = {"zero": scores(3.0, 0.1), "dis": scores(1.0, 8.0), "pyramid": scores(0.9, 30.0)}
+    assert error_by_time(tmp_path / "a.png", {"recordings": flows, "without truth": {"dis": scores(None, 8.0)}})
+    picture = cv2.imread(str(tmp_path / "a.png"))
+    assert picture is not None
+    assert picture.std() > 10
+    assert not error_by_time(tmp_path / "b.png", {"recordings": {"dis": scores(1.0, None)}})
+    assert not (tmp_path / "b.png").exists()
+
+
 def test_drawn_pairs_are_the_same_however_many_are_asked_for():
     few, many = (list(drawn_material(SMALL, number, seed=4).cases()) for number in (2, 9))
     assert len(many) == 9
@@ -353,7 +367,8 @@ def test_the_configuration_fits_its_schema_and_names_every_key():
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         values = OmegaConf.to_container(compose("evaluate_flow"), resolve=True)
     assert isinstance(values, dict)
-    values.pop("paths")
+    for name in ("paths", "suites", "split", "recordings_dir"):  # read by the command itself
+        values.pop(name)
     settings = from_mapping(FlowEvaluationSettings, values)
     assert settings.pairs.height == 160
     assert set(values) == {field.name for field in dataclasses.fields(FlowEvaluationSettings)}
