@@ -162,6 +162,12 @@ def test_a_run_writes_tables_metrics_and_plots(tmp_path):
     out = tmp_path / "out"
     metrics = run_goller(config, out, open_recording=open_recording)
     assert metrics["num_recordings"] == {"train": 2, "validation": 2, "test": 2}
+    assert metrics["paper"]["table_1"]["rfid"] == {"detected": 0.86, "false_alarm": 0.40}
+    assert metrics["paper"]["table_2"]["mp_mt_still"] == {
+        "detected_run": 1.0,
+        "detected": 0.8438,
+        "false_alarm": 0.0219,
+    }
     assert metrics["table_1"]["fused"]["num_leaves"] == 1
     assert metrics["table_1"]["fused"]["detected"] == 1.0
     for file in ("metrics.json", "outcomes.json", "calibration.json", "tables.md", "roc.png", "antennas.png", "handover.png",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 SIMPLE = "sp_st_still"
 """The variant of Table I: one moving tag, two still ones."""
 
@@ -16,3 +18,14 @@ PAPER_TABLE_2: dict[str, tuple[str, float, float, float | None]] = {
     "mp_mt_still": ("MP-MT, 2 moving, 4 still", 1.0, 0.8438, 0.0219),
 }
 """Label, P_D,run, P_D and P_FA by variant."""
+
+
+def paper_rates() -> dict[str, Any]:
+    """Both tables as plain values, with the names of `Rates`."""
+    return {
+        "table_1": {rule: {"detected": found, "false_alarm": false} for rule, (found, false) in PAPER_TABLE_1.items()},
+        "table_2": {
+            variant: {"detected_run": run, "detected": found, "false_alarm": false}
+            for variant, (_, run, found, false) in PAPER_TABLE_2.items()
+        },
+    }

@@ -29,6 +29,7 @@ from ..training import fit_association
 from ..truth import true_states, true_tags
 from .ablation import sensor_ablation
 from .handover import Handover, find_handover, summarise_handovers
+from .paper import paper_rates
 from .rates import (
     Example,
     Rates,
@@ -151,6 +152,7 @@ def run_goller(
     errors = location_error_m(calibration, test, config.settings)
     on_progress("score", 3, 3)
     metrics = {
+        "paper": paper_rates(),
         "table_1": {name: row.to_json() for name, row in simple.items()},
         "table_1_at_papers_false_alarms": {
             name: {"detected": point[0], "false_alarm": point[1]} for name, point in at_paper.items()
