@@ -504,7 +504,7 @@ def test_a_table_says_which_recordings_were_traced_before(root: Path):
     for scores in table["recordings"].values():
         scores[0]["revision"] = "c" * 40
     assert (
-        "1 of 2 recordings were traced at `cccccccccc`; others of each of their rows score the same now."
+        "1 of its 2 recordings were traced at `cccccccccc`; of each row another scores the same now."
         in rendered(table)
     )
 

@@ -131,9 +131,10 @@ def _made_by(table: Mapping[str, Any]) -> str:
     if older := sorted((found, num) for found, num in traced.items() if found not in (None, revision["commit"])):
         num, whole = sum(num for _, num in older), sum(traced.values())
         commits = ", ".join(f"`{found[:10]}`" for found, _ in older)
-        made += (
-            f" {num} of {whole} recordings were traced at {commits}; others of each of their rows score the same now."
-        )
+        if num == whole:
+            made += f" Its recordings were traced at {commits}."
+        else:
+            made += f" {num} of its {whole} recordings were traced at {commits}; of each row another scores the same now."
     return made
 
 
