@@ -146,7 +146,7 @@ def test_past_motion_reaches_back_the_same_time_at_any_frame_rate(rate_hz):
     for frame in range(int(2 * rate_hz)):
         now_s = jnp.asarray(frame / rate_hz)
         displacement = velocity * now_s
-        past = past.add(displacement, jnp.zeros(3, bool), now_s)
+        past = past.add(displacement, now_s)
     for lag_s in (0.17, 0.33, 0.67):
         moved_m, elapsed_s = past.since(lag_s, displacement, jnp.full(3, 9.0), now_s)
         assert float(elapsed_s[0]) == pytest.approx(lag_s, abs=0.6 / rate_hz + 0.02)
@@ -156,8 +156,8 @@ def test_past_motion_reaches_back_the_same_time_at_any_frame_rate(rate_hz):
 def test_a_newborn_segment_has_no_past_of_the_slot_before():
     past = PastMotion.nothing(2, span_s=0.5)
     for frame in range(20):
-        past = past.add(jnp.full((2, 3), 0.1 * frame), jnp.zeros(2, bool), jnp.asarray(frame / 30))
-    past = past.add(jnp.zeros((2, 3)), jnp.array([False, True]), jnp.asarray(20 / 30))
+        past = past.add(jnp.full((2, 3), 0.1 * frame), jnp.asarray(frame / 30))
+    past = past.inherited(jnp.array([-2, -1])).add(jnp.zeros((2, 3)), jnp.asarray(20 / 30))
     moved_m, elapsed_s = past.since(0.3, jnp.full((2, 3), 0.02), jnp.array([9.0, 1 / 30]), jnp.asarray(21 / 30))
     np.testing.assert_allclose(moved_m[1], 0.02, atol=1e-6)
     assert float(elapsed_s[1]) == pytest.approx(1 / 30)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 from jaxtyping import Array
 from test_segment_tracer import EPCS, scene
 
@@ -29,7 +30,7 @@ from tagjax.training.hindsight import HindsightSettings, Piece, PieceFiles, segm
 from tagjax.training.hindsight.objective import hindsight_sums
 from tagjax.training.hindsight.pieces import frame_of
 from tagjax.training.run import run_training
-from tagjax.training.step import clip_gradient
+from tagjax.training.step import clip_gradient, known_mean
 
 SETTINGS = HindsightSettings()
 LOAD = clip_loader(ClipSettings(stride=1, flow="zero"))
@@ -217,7 +218,12 @@ def test_long_recordings_are_cut_and_tags_padded() -> None:
 
 
 def test_files_hold_the_pieces_and_are_made_once(piece: Piece, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    make = lambda: PieceFiles(tmp_path / "pieces").made([scene(70)], TRACER, LOAD, epcs=None, num_frames=256)  # noqa: E731
+    seen = {"control": None, "clips": {"stride": 1}}
+
+    def make(**changed: Any) -> PieceFiles:
+        given = {"epcs": None, "num_frames": 256, "settings": seen, **changed}
+        return PieceFiles(tmp_path / "pieces").made([scene(70)], TRACER, LOAD, **given)
+
     (back,) = make()
     assert (back.name, back.start, back.num_frames) == (piece.name, 0, 70)
     for one, other in zip(jax.tree.leaves(back.frames), jax.tree.leaves(piece.frames), strict=True):
@@ -234,8 +240,36 @@ def test_files_hold_the_pieces_and_are_made_once(piece: Piece, tmp_path: Path, m
     other = dataclasses.replace(scene(70), name="other")
     with pytest.raises(RecordingError, match=rf"found pieces of {piece.name}; expected those of other"):
         files.made([other], TRACER, LOAD, epcs=None, num_frames=256)
+    with pytest.raises(
+        RecordingError, match=r'made with control=null; expected control="foreign"\. Give the same settings'
+    ):
+        make(settings={**seen, "control": "foreign"})
+    with pytest.raises(
+        RecordingError, match=r'controls=false, teacher="smoother"; expected controls=true, teacher="labels"'
+    ):
+        make(teacher="labels", controls=True)
     files.remove()
     assert not (tmp_path / "pieces").exists()
+
+
+def test_pieces_of_another_version_are_refused(piece: Piece, tmp_path: Path) -> None:
+    files = PieceFiles(tmp_path / "pieces").made([scene(70)], TRACER, LOAD, epcs=None, num_frames=256)
+    (path,) = (tmp_path / "pieces").glob("*.safetensors")
+    with safetensors.safe_open(path, framework="numpy") as file:
+        about, leaves = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    del leaves["found.area"]
+    path.write_bytes(safetensors.numpy.save(leaves, about))
+    with pytest.raises(RecordingError, match=r"found no found\.area; expected a piece of this version"):
+        files[0]
+
+
+def test_means_over_nothing_are_unknown_and_left_out_of_the_mean(piece: Piece) -> None:
+    silent = dataclasses.replace(piece.frames, present=jnp.zeros_like(piece.frames.present))
+    loss, logged = eqx.filter_jit(SETTINGS.terms)(TRACER, piece.camera, silent)
+    assert float(loss["hindsight"]) == 0.0
+    assert all(np.isnan(value) for value in logged.values())
+    assert float(known_mean([logged["overlap"], jnp.asarray(0.25), jnp.asarray(0.75)])) == 0.5
+    assert np.isnan(known_mean([logged["overlap"]]))
 
 
 def test_gradients_fade_and_values_stay() -> None:
@@ -256,6 +290,10 @@ LEAST = {
     ("given", "message"),
     [
         ({"hindsight": {}, "objective": {}}, "found both hindsight and objective; expected one"),
+        (
+            {"baselines": {"learned": {}, "peer": {}}},
+            "baselines: found learned; expected other names than learned, untrained",
+        ),
         ({"hindsight": {"sure": 0.3}}, r"hindsight: sure is 0\.3; expected a confidence from 0\.5 to 1"),
         ({"hindsight": {"clip_norm": 0}}, r"hindsight: clip_norm is 0(\.0)?; expected a positive norm"),
         ({"hindsight": {"piece_frames": 0}}, "hindsight: piece_frames is 0; expected at least 1"),

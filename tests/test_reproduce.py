@@ -497,15 +497,27 @@ def test_confirming_needs_a_recording(tmp_path: Path):
         measure(_recipe(), _inputs(tmp_path), confirm=0)
 
 
+def test_a_damaged_table_is_made_again(root: Path, monkeypatch: pytest.MonkeyPatch):
+    """As its error says."""
+    recipe, path = _recipe(), table_path(root, "small")
+    path.parent.mkdir(parents=True)
+    path.write_text("<<<<<<< HEAD\n")
+    with pytest.raises(ValueError, match=r"not JSON .* make the table again"):
+        status(recipe, root)
+    monkeypatch.setattr("tagjax.evaluation.reproduce.make.measure", lambda *_, **__: {})
+    monkeypatch.setattr("tagjax.evaluation.reproduce.make.filled", lambda *_: _made(recipe, root))
+    make_table(recipe, root, suites={}, tracers={}, recordings=root, finished=root)
+    assert status(recipe, root) == []
+
+
 def test_a_table_says_which_recordings_were_traced_before(root: Path):
     recipe = _recipe()
     table = _made(recipe, root)
     assert "were traced at" not in rendered(table)
     for scores in table["recordings"].values():
         scores[0]["revision"] = "c" * 40
-    assert (
-        "1 of its 2 recordings were traced at `cccccccccc`; of each row another scores the same now."
-        in rendered(table)
+    assert "1 of its 2 recordings were traced at `cccccccccc`; of each row another scores the same now." in rendered(
+        table
     )
 
 

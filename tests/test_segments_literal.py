@@ -164,6 +164,7 @@ def test_the_cut_is_the_segments_beyond_the_last_corner():
         ({"dwell": None, "hidden": None}, "dwell and attention are both off"),
         ({"dwell": None, "attention": EVIDENCE}, "Set hidden to null"),
         ({"body": None}, "Set whole to null"),
+        ({"travel": None}, "body is on and travel is off"),
     ],
 )
 def test_stages_that_need_each_other(settings, message):

@@ -18,7 +18,7 @@ from ..report.page import write_page
 from ..tagattention.tracer_settings import baseline_clips, learned_tracer, make_tracer, tracer_clips
 from ..tracing.clips import ClipSettings
 from ..training.checkpoint import Checkpoints
-from ..training.config import TrainConfig
+from ..training.config import TrainConfig, check_baselines
 from ..training.evaluate import evaluate_tracers
 from ..training.run import evaluation_flow, initial_state
 from ..training.sources import DataSettings, training_recordings
@@ -123,6 +123,7 @@ class EvaluateConfig:
     progress: bool = True
 
     def __post_init__(self) -> None:
+        check_baselines(self.baselines or ())
         changed(ClipSettings(), self.clips, where="clips")
         changed(ScoreSettings(), self.scores, where="scores")
         for name, other in (("tracer", self.tracer), ("weights", self.weights)):

@@ -43,9 +43,9 @@ def describe_arrays(tree: PyTree) -> dict[str, str]:
 
 
 class Checkpoints:
-    """The checkpoints of one run, in one folder; the newest few and every `keep_every`-th are kept."""
+    """The checkpoints of one run, in one folder; the newest three are kept."""
 
-    def __init__(self, folder: Path | str, *, keep: int = 3, keep_every: int | None = None, create: bool = True):
+    def __init__(self, folder: Path | str, *, create: bool = True):
         """Raises `CheckpointError` if the folder is missing and is not to be created."""
         self.folder = Path(folder).absolute()
         self._manager: ocp.CheckpointManager | None = None
@@ -59,8 +59,7 @@ class Checkpoints:
         if create:  # a run that only reads may look at the folder of one that is writing a checkpoint
             self._remove_unfinished()
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep,
-            keep_period=keep_every,
+            max_to_keep=3,
             create=False,
             enable_async_checkpointing=False,
             multiprocessing_options=ocp.options.MultiprocessingOptions(active_processes={0})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ..core.settings import ConfigError
@@ -15,6 +15,18 @@ from .loop import LoopSettings
 from .objective import ObjectiveSettings
 from .processes import DistributedSettings
 from .sources import DataSettings
+
+RUNS_OWN = ("learned", "untrained", "initial")
+"""Names of a run's or an evaluation's own tracers."""
+
+
+def check_baselines(baselines: Iterable[str]) -> None:
+    """Raises `ConfigError` for a baseline with the name of a run's own tracer, whose place it would take."""
+    if taken := sorted({*baselines}.intersection(RUNS_OWN)):
+        raise ConfigError(
+            f"baselines: found {', '.join(taken)}; expected other names than {', '.join(RUNS_OWN)}, which are those of the run's "
+            "own tracers. For example tracer@baselines.peer=tagattention."
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +53,7 @@ class TrainConfig:
     scores: ScoreSettings = dataclasses.field(default_factory=ScoreSettings)
 
     def __post_init__(self) -> None:
+        check_baselines(self.baselines)
         if self.hindsight is not None and self.objective is not None:
             raise ConfigError(
                 "found both hindsight and objective; expected one: objective=hindsight or, say, coherent."

@@ -15,6 +15,7 @@ from rich.console import Console
 from ..core.errors import RecordingError
 from ..core.folder_lock import locked_folder
 from ..core.progress import progress_lines
+from ..core.results import to_json_values
 from ..core.settings import ConfigError
 from ..core.stream import Stream
 from ..recording import Recording
@@ -106,6 +107,7 @@ def _pieces(
                 num_frames=settings.piece_frames,
                 teacher=settings.teacher,
                 controls=settings.needs_controls,
+                settings=_seen_with(config, settings),
                 on_progress=report,
             )
     files, sure = found["training"], found["training"].num_sure(settings)
@@ -130,6 +132,17 @@ def _pieces(
     console.print(f"{len(windows)} windows of {length} frames for the flow network.")
     batch_size = config.loop.batch_size or 1
     return TrainingData(_stream(windows, batch_size, config), batch_size, held_out, score, remove)
+
+
+def _seen_with(config: TrainConfig, settings: HindsightSettings) -> dict[str, Any]:
+    """The settings on which the segments of pieces depend. Pieces that are kept may come from another tracer."""
+    seen = {
+        "clips": config.data.clips.arguments(),
+        "control": config.data.control,
+        "virtual_tag": config.data.virtual_tag,
+    }
+    own = {} if settings.pieces else {"tracer": config.tracer, "weights": config.weights}
+    return to_json_values({**seen, **own})
 
 
 def _stream(samples: Sequence[ClipLike] | PieceFiles | PieceWindows, batch_size: int, config: TrainConfig) -> Stream:

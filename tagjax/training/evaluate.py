@@ -69,7 +69,7 @@ def evaluate_tracers(
     names = recording_names(recordings)
     lengths = [recordings[number].num_frames if frames is None else frames[1] - frames[0] for _, number in work]
     with progress_lines(shown=progress) as report:
-        counter = itertools.count()
+        done, total = itertools.count(1), sum(lengths)
         for name, number in work:
             recording, own = recordings[number], settings.supported_by(tracers[name])
             kept = overlay_folder(folder, names[number], labels[name])
@@ -82,7 +82,7 @@ def evaluate_tracers(
                     epcs=epcs,
                     settings=own,
                     frames=frames,
-                    on_frame=_frame_counter(report, counter, sum(lengths), f"{labels[name]}: {names[number]}"),
+                    on_frame=_frame_counter(report, done, total, f"{labels[name]}: {names[number]}"),
                     on_picture=on_picture,
                 )
             results[labels[name]].append(result)
@@ -90,11 +90,9 @@ def evaluate_tracers(
     return write_report(folder, results)
 
 
-def _frame_counter(report: OnProgress, counter: Iterator[int], total: int, now: str) -> Callable[[], None]:
+def _frame_counter(report: OnProgress, done: Iterator[int], total: int, now: str) -> Callable[[], None]:
     """Reports one more frame at each call."""
-    if (done := next(counter)) == 0:
-        report("evaluate", done, total, now)
-    return lambda: report("evaluate", next(counter), total, now)
+    return lambda: report("evaluate", next(done), total, now)
 
 
 def _write_stages(folder: Path, result: RecordingResult, clips: ClipSettings, first: int) -> None:

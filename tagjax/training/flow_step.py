@@ -1,4 +1,4 @@
-"""State and update of flow training: the unsupervised loss of a batch, Adam, and a running average of the weights."""
+"""State and update of flow training: the loss of a batch, the optimiser, and a running average of the weights."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from ..flow.loss_terms import crop_margin_px, occluded, self_supervision_term
 from ..flow.losses import FlowLossSettings, distillation_term, level_terms, sequence_terms, total_loss
 from ..flow.network import AbstractFlowNetwork, Levels, flow_both_ways
 from .devices import check_batch, replicate, shard
+from .optimizers import guarded_update
 
 
 class FlowTrainState(eqx.Module):
@@ -137,25 +138,20 @@ def _update(
         return batch_loss(network, clean, augmented, state.step, settings, self_supervise=self_supervise)
 
     (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(learnable)
-    norm = optax.tree.norm(gradient)
-    usable = jnp.isfinite(norm) & jnp.isfinite(value)
-    safe = jax.tree.map(lambda g: jnp.where(usable, g, jnp.zeros_like(g)), gradient)
-    with jax.numpy_dtype_promotion("standard"):  # Optax takes powers of its integer step count
-        updates, optimizer_state = optimizer.update(safe, state.optimizer_state, learnable)
-    keep = lambda new, old: jnp.where(usable, new, old)  # noqa: E731
-    learnt = jax.tree.map(keep, optax.apply_updates(learnable, updates), learnable)
+    learnt, optimizer_state, usable = guarded_update(optimizer, gradient, value, state.optimizer_state, learnable)
     # The average starts as the mean of all steps, so that the influence of the first weights decays quickly.
     done = state.step.astype(jnp.float32)
     weight = jnp.maximum(1 / average_over, 1 / (done + 1))
     averaged, _ = eqx.partition(state.average, eqx.is_inexact_array)
-    averaged = jax.tree.map(lambda a, b: a + weight * (b - a), averaged, learnt)
+    averaged = jax.tree.map(lambda a, b: jnp.where(usable, a + weight * (b - a), a), averaged, learnt)
     after = FlowTrainState(
         eqx.combine(learnt, static),
         eqx.combine(averaged, static),
-        jax.tree.map(keep, optimizer_state, state.optimizer_state),
+        optimizer_state,
         state.step + 1,
         state.key,
     )
+    norm = optax.tree.norm(gradient)
     numbers = {**terms, "loss": value, "gradient_norm": norm, "skipped": 1.0 - usable.astype(jnp.float32)}
     return after, numbers
 

@@ -127,7 +127,7 @@ def train(
     in all processes; `displayed` lists those beside the progress. `validate` returns metrics that are logged under
     `validation/`; `after_step` is called after every step.
 
-    A step with `skipped` = 1 leaves the parameters unchanged, and no checkpoint is written after it. Raises
+    A step with `skipped` = 1 leaves the parameters unchanged, and no periodic checkpoint is written after it. Raises
     `DivergedError` after `stop_after_skipped` of them in a row; its message gives the last checkpoint before them.
     """
     first_step, skipped, batch_size = int(state.step), 0, local_batch_size(settings.batch_size)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..core.build import Slot, build, find_target
 from ..core.settings import ConfigError
@@ -106,3 +107,19 @@ def _step(key: Any, where: str) -> int:
     if isinstance(key, bool) or not (text.isascii() and text.isdigit() and len(text) <= 9):
         raise ConfigError(f"{where}: found the step {text[:60]!r}; expected the number of a step, 0 to 999999999.")
     return int(text)
+
+
+def guarded_update(
+    optimizer: optax.GradientTransformation, gradient: PyTree, loss: Float[Array, ""], state: PyTree, learnable: PyTree
+) -> tuple[PyTree, PyTree, Bool[Array, ""]]:
+    """The arrays `learnable` and the optimiser's state after an update, and whether there was one: a loss or a gradient that
+    is not finite changes nothing.
+    """
+    usable = jnp.isfinite(optax.tree.norm(gradient)) & jnp.isfinite(loss)
+    safe = jax.tree.map(lambda g: jnp.where(usable, g, jnp.zeros_like(g)), gradient)
+    with jax.numpy_dtype_promotion("standard"):  # Optax takes powers of its integer step count
+        updates, after = optimizer.update(safe, state, learnable)
+    moved = optax.apply_updates(learnable, updates)
+    new, old = (moved, after), (learnable, state)
+    (learnable, state) = jax.tree.map(lambda new, old: jnp.where(usable, new, old), new, old)
+    return learnable, state, usable

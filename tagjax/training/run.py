@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 import optax
 from rich.console import Console
 
@@ -37,7 +36,7 @@ from .optimizers import build_optimizer
 from .processes import distributed_runtime, is_first, local_batch_size
 from .sources import training_recordings
 from .state import TrainState
-from .step import ClipLike, clip_loss, make_joint_optimizer, make_optimizer, train_step
+from .step import ClipLike, clip_loss, known_mean, make_joint_optimizer, make_optimizer, train_step
 
 
 def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
@@ -79,9 +78,9 @@ def run_training(
 ) -> float:
     """Train as configured, evaluate on the validation recordings, and return the objective of a sweep, to be maximised.
 
-    The objective is the mean box IoU on the validation recordings if they are labelled, else the masks' overlap with the
-    smoother's, or, without hindsight, the coherence of the reads with the masks' motion; NaN without validation
-    recordings. `folder` then holds checkpoints, metrics.jsonl, the learned parameters (weights.json, parameters.json,
+    The objective is the mean box IoU on the validation recordings if they are labelled. Else it is, with hindsight, the masks'
+    overlap with the teacher's (with `learn=reads` the nats of a read), and without it the coherence of the reads with the masks'
+    motion; NaN without validation recordings. `folder` then holds checkpoints, metrics.jsonl, the learned parameters (weights.json, parameters.json,
     flow.safetensors), and with validation recordings metrics.json, report/ and the page report.html.
     Ctrl-C and SIGTERM make it write a checkpoint and raise `KeyboardInterrupt` or `Terminated`; the run resumes when it is
     started again in the same folder. With several processes (`config.distributed`) process 0 writes and evaluates; the
@@ -233,11 +232,13 @@ def _report(
 
 
 def validation_metrics(state: TrainState, held_out: Iterable[ClipLike], config: TrainConfig) -> dict[str, float]:
-    """Mean of every term and diagnostic over the held-out samples, always with the same random numbers; empty without samples."""
+    """Mean of every term and diagnostic over the held-out samples that have it, always with the same random numbers; empty
+    without samples.
+    """
     key = jax.random.PRNGKey(config.seed)
     values = [clip_loss(state.model, sample.camera, sample.frames, key, config.learned) for sample in held_out]
     names = values[0] if values else ()
-    return {name: float(np.mean([float(sample[name]) for sample in values])) for name in names}
+    return {name: float(known_mean([sample[name] for sample in values])) for name in names}
 
 
 def _describe(console: Console, training: Sequence[Recording], validation: Sequence[Recording]) -> None:

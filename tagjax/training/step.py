@@ -25,6 +25,7 @@ from .devices import AXIS, local_mesh, replicate_locally, shard_locally
 from .hindsight import FilmedFrames, HindsightSettings, PieceFrames
 from .joint import Flow, JointModel, network_flow
 from .objective import ObjectiveSettings, objective
+from .optimizers import guarded_update
 from .processes import mean_over_processes
 from .state import TrainState
 
@@ -96,11 +97,10 @@ def clip_gradient(
 def _clip_gradient(
     model: Model, camera: Camera, frames: Frames, key: Array, settings: Objective
 ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
+    bounded = settings.bounded if isinstance(settings, HindsightSettings) else lambda gradient: gradient
     if not isinstance(model, JointModel):
         (gradient, _), logged = _term_gradients(model, None, camera, frames, key, settings)
-        if isinstance(settings, HindsightSettings):
-            gradient = settings.bounded(gradient)
-        return gradient, logged
+        return bounded(gradient), logged
     assert not isinstance(frames, PieceFrames)
     learnable, static = eqx.partition(model.network, eqx.is_inexact_array)
 
@@ -114,7 +114,7 @@ def _clip_gradient(
     (by_network,) = pull((by_flow, jnp.asarray(model.weight, loss.dtype)))
     logged |= {**terms, "flow": loss, "loss": logged["loss"] + model.weight * loss}
     logged["gradient_norm/network"] = optax.tree.norm(by_network)
-    return JointModel(gradient, by_network, model.weight, model.loss), logged
+    return JointModel(bounded(gradient), by_network, model.weight, model.loss), logged
 
 
 def _term_gradients(
@@ -233,21 +233,19 @@ def clip_loss(
     return {**terms, **diagnostics, **values, "loss": loss}
 
 
+def known_mean(values: Sequence[Array]) -> Float[Array, ""]:
+    """The mean of the values that are not NaN; NaN without any."""
+    return jnp.nanmean(jnp.stack([jnp.asarray(value) for value in values]))
+
+
 @eqx.filter_jit
 def _apply(
     state: TrainState, gradient: PyTree, loss: Array, optimizer: optax.GradientTransformation
 ) -> tuple[TrainState, dict[str, Array]]:
-    norm = optax.tree.norm(gradient)
-    usable = jnp.isfinite(norm) & jnp.isfinite(loss)
-    safe = jax.tree.map(lambda g: jnp.where(usable, g, jnp.zeros_like(g)), gradient)
     learnable, static = eqx.partition(state.model, eqx.is_inexact_array)
-    with jax.numpy_dtype_promotion("standard"):  # Optax takes powers of its integer step count
-        updates, optimizer_state = optimizer.update(safe, state.optimizer_state, learnable)
-    keep = lambda new, old: jnp.where(usable, new, old)  # noqa: E731
-    model = eqx.combine(jax.tree.map(keep, optax.apply_updates(learnable, updates), learnable), static)
-    optimizer_state = jax.tree.map(keep, optimizer_state, state.optimizer_state)
-    done = TrainState(model, optimizer_state, state.step + 1, state.key)
-    return done, {"gradient_norm": norm, "skipped": 1.0 - usable.astype(jnp.float32)}
+    learnable, optimizer_state, usable = guarded_update(optimizer, gradient, loss, state.optimizer_state, learnable)
+    done = TrainState(eqx.combine(learnable, static), optimizer_state, state.step + 1, state.key)
+    return done, {"gradient_norm": optax.tree.norm(gradient), "skipped": 1.0 - usable.astype(jnp.float32)}
 
 
 def train_step(
@@ -272,7 +270,8 @@ def train_step(
         total = gradient if total is None else jax.tree.map(jnp.add, total, gradient)
         logs.append(logged)
     mean = jax.tree.map(lambda leaf: leaf / len(clips), total)
-    averaged = {name: sum(log[name] for log in logs) / len(logs) for name in logs[0]}
+    averaged = {name: known_mean([log[name] for log in logs]) for name in logs[0] if name != "loss"}
+    averaged["loss"] = jnp.mean(jnp.stack([log["loss"] for log in logs]))
     mean, averaged = mean_over_processes((mean, averaged))
     state, more = _apply(state, mean, jnp.asarray(averaged["loss"]), optimizer)
     return state, {name: float(value) for name, value in {**averaged, **more}.items()}

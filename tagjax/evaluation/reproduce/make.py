@@ -34,7 +34,7 @@ def make_table(
     """
     begun, path = begin(recipe, root), table_path(root, recipe.name)
     inputs = Inputs(suites, tracers, recordings, finished, begun["depends"], workers, begun["revision"]["commit"])
-    before = scores_by_recording(read_table(path))
+    before = {} if confirm is None else scores_by_recording(read_table(path))
     scores = measure(recipe, inputs, before=before, confirm=confirm, on_progress=on_progress)
     table = filled(begun, recipe, scores)
     write_table(path, table)

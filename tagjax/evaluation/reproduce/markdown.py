@@ -134,7 +134,9 @@ def _made_by(table: Mapping[str, Any]) -> str:
         if num == whole:
             made += f" Its recordings were traced at {commits}."
         else:
-            made += f" {num} of its {whole} recordings were traced at {commits}; of each row another scores the same now."
+            made += (
+                f" {num} of its {whole} recordings were traced at {commits}; of each row another scores the same now."
+            )
     return made
 
 

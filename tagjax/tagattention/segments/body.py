@@ -137,7 +137,7 @@ class CarryingBody(eqx.Module):
         newborn = newborn_source > -2
         inherited = jnp.where((newborn_source > 0)[None], state.membership[:, jnp.maximum(newborn_source, 0)], 0.0)
         membership = jnp.where(newborn[None], inherited, state.membership)
-        past = state.past.inherited(newborn_source).add(displacement_m, newborn & (newborn_source <= 0), now_s)
+        past = state.past.inherited(newborn_source).add(displacement_m, now_s)
         moved_m, time_s = past.since(self.speed_s, displacement_m, life_s, now_s)
         # A segment's first frames show more noise than motion: half the time counts at least.
         speed_m_s = safe_norm(moved_m) / jnp.maximum(time_s, 0.5 * self.speed_s)

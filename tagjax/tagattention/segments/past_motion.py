@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 
 class PastMotion(eqx.Module):
@@ -32,17 +32,14 @@ class PastMotion(eqx.Module):
             span_s=span_s,
         )
 
-    def add(
-        self, displacement_m: Float[Array, "segment 3"], newborn: Bool[Array, " segment"], now_s: Float[Array, ""]
-    ) -> PastMotion:
-        """With the displacements of this frame, if the last entry is old enough. Newborn segments have no past."""
+    def add(self, displacement_m: Float[Array, "segment 3"], now_s: Float[Array, ""]) -> PastMotion:
+        """With the displacements of this frame, if the last entry is old enough."""
         num_entries = self.time_s.shape[0]
-        past = jnp.where(newborn[None, :, None], 0.0, self.displacement_m)
         # Half a millisecond: times are float32 seconds, and frames that are due must not be missed by rounding.
         due = now_s - self.time_s[self.newest] >= self.span_s / (num_entries - 2) - 5e-4
         at = jnp.where(due, (self.newest + 1) % num_entries, self.newest)
         return PastMotion(
-            displacement_m=past.at[at].set(jnp.where(due, displacement_m, past[at])),
+            displacement_m=self.displacement_m.at[at].set(jnp.where(due, displacement_m, self.displacement_m[at])),
             time_s=self.time_s.at[at].set(jnp.where(due, now_s, self.time_s[at])),
             newest=at.astype(jnp.int32),
             span_s=self.span_s,

@@ -90,6 +90,11 @@ class TagAttention(AbstractSmoother):
             raise ValueError("free is on and dwell is off; expected dwell, whose memory it shares. Set free to null.")
         if self.unknown_depth is not None and self.dwell is None:
             raise ValueError("unknown_depth is on and dwell is off; expected dwell, whose memory it has.")
+        if self.body is not None and self.travel is None:
+            raise ValueError(
+                "body is on and travel is off; expected travel, which carries on the motion of new segments. For no pooling of "
+                "evidence set travel.heal_s to a long time, such as 1.0e9."
+            )
         if self.whole is not None and self.body is None:
             raise ValueError("whole is on and body is off; expected a body that it completes. Set whole to null.")
         if self.competition is not None and self.body is None:

@@ -141,7 +141,7 @@ class TravellingTogether(eqx.Module):
 
         after = _inherit(state, source)
         displacement_m = after.displacement_m + jnp.where(newborn[:, None], 0.0, motion_m)
-        past = after.past.add(displacement_m, source == -1, now_s)
+        past = after.past.add(displacement_m, now_s)
         after = TravelState(past, displacement_m, after.life_s + dt_s)
         found = eqx.tree_at(
             lambda one: (one.increment_m, one.displacement_m, one.life_s, one.source),

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -53,12 +54,14 @@ class PieceFiles:
         num_frames: int,
         teacher: Teacher = "smoother",
         controls: bool = False,
+        settings: Mapping[str, Any] = MappingProxyType({}),
         on_progress: OnProgress = unobserved,
     ) -> PieceFiles:
         """The folder with the pieces of all recordings; those that it holds already are taken as they are.
 
-        With `controls` each piece has control reads (`control_of`). `on_progress` counts the recordings. Raises
-        `RecordingError` where the folder holds pieces of other recordings.
+        With `controls` each piece has control reads (`control_of`). `settings`, plain values, are those on which `recordings` and
+        `load` depend. `on_progress` counts the recordings. Raises `RecordingError` where the folder holds pieces of other
+        recordings, or made with other arguments.
         """
         make_folder(self.folder)
         held, asked = [one["recording"] for one in self._index()], [recording.name for recording in recordings]
@@ -67,6 +70,9 @@ class PieceFiles:
                 f"{self.folder}: found pieces of {_listed(held)}; expected those of {_listed(asked)}, in this order. Give "
                 "the same recordings, or another folder."
             )
+        made_with = {**settings, "epcs": None if epcs is None else list(epcs), "num_frames": num_frames}
+        made_with |= {"teacher": teacher, "controls": controls}
+        self._check_made_with(made_with)
         stage = f"{self.folder.name} recordings: segments and masks"
         for recording in recordings[len(self._index()) :]:
             tags, names, index = selected_tags(recording, epcs), [], self._index()
@@ -77,9 +83,19 @@ class PieceFiles:
             ):
                 names.append(f"{len(index):04d}-{len(names):03d}.safetensors")
                 _write(self.folder / names[-1], piece)
-            write_json(self.folder / _INDEX, [*index, {"recording": recording.name, "files": names}])
+            entry = {"recording": recording.name, "files": names, "made_with": made_with}
+            write_json(self.folder / _INDEX, [*index, entry])
             on_progress(stage, len(index) + 1, len(recordings))
         return self
+
+    def _check_made_with(self, made_with: Mapping[str, Any]) -> None:
+        for one in self._index():
+            found = one["made_with"]
+            if other := sorted(name for name in {*found, *made_with} if found.get(name) != made_with.get(name)):
+                raise RecordingError(
+                    f"{self.folder}: found pieces made with {_values(other, found)}; expected {_values(other, made_with)}. "
+                    "Give the same settings, or another folder."
+                )
 
     def recording_of(self, index: int) -> int:
         """The number of the recording that a piece is of."""
@@ -108,7 +124,7 @@ class PieceFiles:
         return [name for one in self._index() for name in one["files"]]
 
     def _index(self) -> list[dict[str, Any]]:
-        """Of each recording its name (`recording`) and the names of its `files`."""
+        """Of each recording its name (`recording`), the names of its `files`, and what they were `made_with`."""
         path = self.folder / _INDEX
         return json.loads(path.read_text()) if path.exists() else []
 
@@ -118,10 +134,15 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
+def _values(names: Sequence[str], values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={json.dumps(values.get(name))}" for name in names)
+
+
 def _write(path: Path, piece: Piece) -> None:
     leaves = {name: np.ascontiguousarray(leaf) for name, leaf in named_arrays(piece.frames).items()}
     leaves |= {"camera.rays": np.asarray(piece.camera.rays), "camera.antennas_m": np.asarray(piece.camera.antennas_m)}
-    leaves["found.labels"] = leaves["found.labels"].astype(np.int16)
+    if piece.frames.found.area.shape[-1] <= 2**15:
+        leaves["found.labels"] = leaves["found.labels"].astype(np.int16)
     about = {"name": piece.name, "start": str(piece.start), "num_frames": str(piece.num_frames)}
     write_atomic(path, safetensors.numpy.save(leaves, about))
 
@@ -131,8 +152,21 @@ def _read(path: Path) -> Piece:
         about = file.metadata()
         leaves = {name: jnp.asarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
     leaves["found.labels"] = leaves["found.labels"].astype(jnp.int32)
-    camera = Camera(leaves["camera.rays"], leaves["camera.antennas_m"])
-    return Piece(camera, _built(PieceFrames, leaves), about["name"], int(about["start"]), int(about["num_frames"]))
+    try:
+        camera, frames = Camera(leaves["camera.rays"], leaves["camera.antennas_m"]), _built(PieceFrames, leaves)
+    except KeyError as error:
+        raise RecordingError(
+            f"{path}: found no {error.args[0]}; expected a piece of this version. Give another folder for the pieces."
+        ) from error
+    return Piece(camera, frames, about["name"], int(about["start"]), int(about["num_frames"]))
+
+
+def _kind(name: str) -> type:
+    """The module that has this name in a piece. Raises `KeyError` for the name of an array."""
+    try:
+        return _NESTED[name.rpartition(".")[2]]
+    except KeyError:
+        raise KeyError(name) from None
 
 
 def _built(kind: type, leaves: Mapping[str, Any], before: str = "") -> Any:
@@ -140,8 +174,5 @@ def _built(kind: type, leaves: Mapping[str, Any], before: str = "") -> Any:
     if not any(name.startswith(before) for name in leaves):
         return None
     names = [before + field.name for field in dataclasses.fields(kind)]
-    built = [
-        leaves[name] if name in leaves else _built(_NESTED[name.rpartition(".")[2]], leaves, f"{name}.")
-        for name in names
-    ]
+    built = [leaves[name] if name in leaves else _built(_kind(name), leaves, f"{name}.") for name in names]
     return kind(*built)

@@ -79,7 +79,7 @@ class HindsightSettings:
     def terms(
         self, tracer: AbstractTracer, camera: Camera, frames: PieceFrames | FilmedFrames
     ) -> tuple[dict[str, Float[Array, ""]], dict[str, Array]]:
-        """The loss of a piece, and what it consists of."""
+        """The loss of a piece, and what it consists of; NaN for a mean over nothing."""
         assert isinstance(tracer, TagAttention)
         tracer = self.learning(tracer)
         if isinstance(frames, FilmedFrames):
@@ -88,8 +88,8 @@ class HindsightSettings:
             nats, number = read_nats(
                 tracer.reader, camera.antennas_m.shape[0], frames, frames.present & (frames.confidence > self.sure)
             )
-            mean = safe_divide(jnp.sum(nats), jnp.sum(number))
-            return {"hindsight": -mean}, {"nats": mean}
+            total, count = jnp.sum(nats), jnp.sum(number)
+            return {"hindsight": -safe_divide(total, count)}, {"nats": _known_mean(total, count)}
         sums, loss = hindsight_sums(tracer, camera, frames, self), jnp.zeros(())
         if self.learn == "place":
             loss = loss + safe_divide(sums.surprise, sums.num_there)
@@ -98,15 +98,19 @@ class HindsightSettings:
         if self.learn in ("all", "confidence"):
             loss = loss + safe_divide(sums.wrong, sums.num_there + sums.num_away)
         logged = {
-            "overlap": 1.0 - safe_divide(sums.missed, sums.num_there),
-            "place_nats": safe_divide(sums.surprise, sums.num_there),
-            "false_confidence": safe_divide(sums.claimed, sums.num_away),
+            "overlap": 1.0 - _known_mean(sums.missed, sums.num_there),
+            "place_nats": _known_mean(sums.surprise, sums.num_there),
+            "false_confidence": _known_mean(sums.claimed, sums.num_away),
         }
-        if frames.control is not None:
+        if self.needs_controls:
             strange = control_sums(tracer, camera, frames, self)
             loss = loss + self.controls / (1.0 - self.controls) * safe_divide(strange.wrong, strange.num)
-            logged["false_confidence/control"] = safe_divide(strange.claimed, strange.num)
+            logged["false_confidence/control"] = _known_mean(strange.claimed, strange.num)
         return {"hindsight": loss}, logged
+
+
+def _known_mean(total: Float[Array, ""], count: Float[Array, ""]) -> Float[Array, ""]:
+    return jnp.where(count > 0, safe_divide(total, count), jnp.nan)
 
 
 class HindsightSums(NamedTuple):

@@ -45,12 +45,11 @@ def future_agreement(
     """
     num_window = frames.radio.relative_m.shape[-1]
     num_frames, height, width = frames.depth_m.shape
-    num_compared = max(num_frames - (num_window - 1), 1)
     if num_frames < num_window:
         raise ValueError(
             f"found a clip of {num_frames} frames; expected at least {num_window}, the length of a window."
         )
-    stride = settings.future_stride
+    stride, num_compared = settings.future_stride, num_frames - (num_window - 1)
     ranges = camera.ranges_m(camera.rays[None] * frames.depth_m[..., None])
     ranges = jnp.where(frames.depth_m[None] > 0, ranges, 0.0)
     rows, columns = jnp.meshgrid(jnp.arange(0, height, stride), jnp.arange(0, width, stride), indexing="ij")
