@@ -1,4 +1,4 @@
-"""Compare optical flows on synthetic pairs, recordings with exact flow, Middlebury's scenes, and videos.
+"""Compare optical flows on synthetic pairs, recordings with exact flow, Middlebury's scenes, FlyingChairs, and videos.
 
 python -m experiments.evaluate_flow 'flows=[zero,dis,pyramid]'
 python -m experiments.evaluate_flow 'suites=[corpus]' max_pairs=8   # whose recordings hold their exact flow

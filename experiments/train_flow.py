@@ -1,4 +1,4 @@
-"""Train an optical-flow network without labels: on synthetic pairs, recordings, videos and folders of pictures.
+"""Train an optical-flow network without labels: on synthetic pairs, recordings, videos, folders of pictures and FlyingChairs.
 
 python -m experiments.train_flow
 python -m experiments.train_flow recipe=fine_tune 'data.sequences=[my_video.mp4]'

@@ -69,6 +69,8 @@ def test_every_training_configuration_is_valid(override: str) -> None:
         ["recipe=student"],
         ["recipe=flownet"],
         ["recipe=flownet", "flow=flownet_c"],
+        ["recipe=[flownet,fine_tune]"],
+        ["flow_loss@loss=unflow"],
     ],
 )
 def test_every_flow_training_configuration_is_valid(overrides: list[str]) -> None:

@@ -18,13 +18,22 @@ from ..core.machine import machine
 from ..core.names import safe_file_name
 from ..core.progress import progress_lines
 from ..core.results import write_json
+from ..flow.flying_chairs import is_flying_chairs
 from ..flow.opencv import FlowFunction
 from ..flow.registry import flow_key, make_flow, split_suffixes
 from ..metrics.flow import FlowScores, endpoint_error, warped_error
 from ..recording.image_files import write_image
 from ..report.flow import flow_panel
 from ..sim.flow_pairs import FlowPairSettings
-from .flow_cases import FlowCase, Material, drawn_material, folder_material, recording_material, sequence_material
+from .flow_cases import (
+    FlowCase,
+    Material,
+    chairs_material,
+    drawn_material,
+    folder_material,
+    recording_material,
+    sequence_material,
+)
 
 _COLUMNS = {
     "epe_px": "EPE px",
@@ -54,10 +63,10 @@ class FlowEvaluationSettings:
     photographs: bool = False  # photographs of installed packages on synthetic layers; they may differ between machines
     pairs: FlowPairSettings = dataclasses.field(default_factory=FlowPairSettings)
     recordings: tuple[str, ...] = ()
-    folders: tuple[str, ...] = ()  # in Middlebury's format
+    folders: tuple[str, ...] = ()  # in Middlebury's format, or of FlyingChairs
     sequences: tuple[str, ...] = ()  # videos and folders of pictures, without truth
     every: int = 5  # of recordings and sequences, every n-th picture and the next
-    max_pairs: int = 40  # of one recording or sequence
+    max_pairs: int = 40  # of one recording, sequence or folder of FlyingChairs
     moving_px: float = 0.5
     num_panels: int = 4  # of each material
     cache: str = "recordings"  # for decoded videos
@@ -86,7 +95,10 @@ class FlowEvaluationSettings:
             materials.append(drawn_material(self.pairs, self.num_pairs, seed=self.pair_seed, photographs=photographs))
         if self.recordings:
             materials.append(recording_material(self.recordings, every=self.every, max_pairs=self.max_pairs))
-        materials += [folder_material(path) for path in self.folders]
+        materials += [
+            chairs_material(path, max_pairs=self.max_pairs) if is_flying_chairs(Path(path)) else folder_material(path)
+            for path in self.folders
+        ]
         if self.sequences:
             materials.append(
                 sequence_material(self.sequences, Path(self.cache), every=self.every, max_pairs=self.max_pairs)

@@ -1,4 +1,6 @@
-"""Pairs of pictures for the evaluation of flows: synthetic ones, recordings, folders in Middlebury's format, and videos."""
+"""Pairs of pictures for the evaluation of flows: synthetic ones, recordings, folders in Middlebury's format, FlyingChairs, and
+videos.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
 from ..flow.flo_files import read_flo
+from ..flow.flying_chairs import FlyingChairs
 from ..flow.image_sequences import open_sequence
 from ..flow.images import check_images
 from ..recording import RecordingError
@@ -109,6 +112,24 @@ def folder_material(path: str) -> Material:
             yield FlowCase(scene.name, scene.name, first, second, truth)
 
     return Material(root.name, len(scenes), cases)
+
+
+def chairs_material(path: str, *, max_pairs: int) -> Material:
+    """The first `max_pairs` validation pairs of a FlyingChairs folder, or of all its pairs where it has no split.
+
+    Raises the errors of `FlyingChairs`, and `RecordingError` for a pair without flow.
+    """
+    chairs = FlyingChairs(Path(path), "validation")
+    chairs.check_flow()
+    name = "FlyingChairs" if chairs.split_file is None else "FlyingChairs, validation"
+    count = min(max_pairs, len(chairs.numbers))
+
+    def cases() -> Iterator[FlowCase]:
+        for index in range(count):
+            first, second = chairs[index]
+            yield FlowCase(name, f"chairs-{chairs.numbers[index]}", first, second, chairs.flow_px(index))
+
+    return Material(name, count, cases)
 
 
 def sequence_material(paths: tuple[str, ...], cache: Path, *, every: int, max_pairs: int) -> Material:

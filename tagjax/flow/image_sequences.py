@@ -20,6 +20,7 @@ from ..core.types import LazyArray
 from ..recording import RecordingError
 from ..recording.image_files import natural_sorted, read_colour
 from ..recording.store import open_recording
+from .flying_chairs import is_flying_chairs
 
 VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".webp")
@@ -103,9 +104,15 @@ def _size(shape: Sequence[int]) -> str:
 def open_sequence(path: str, cache: Path) -> LazyArray:
     """Images (frame, height, width, 3), uint8, of a recording (.zarr), a video file or a folder of images.
 
-    A video is decoded once, into `cache`. Raises `RecordingError` for anything else, and for fewer than two images.
+    A video is decoded once, into `cache`. Raises `RecordingError` for anything else, for fewer than two images, and for
+    the pairs of FlyingChairs, which are no sequence.
     """
     location = Path(path)
+    if is_flying_chairs(location):
+        raise RecordingError(
+            f"{path}: found the pairs of FlyingChairs; expected a sequence, whose successive images belong together. Name "
+            "it in data.sequences of train_flow or in folders of evaluate_flow, which take its pairs."
+        )
     if location.suffix == ".zarr" or path.startswith(("http://", "https://")):
         sequence: LazyArray = open_recording(path).colour
     elif location.is_dir():

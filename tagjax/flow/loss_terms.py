@@ -1,7 +1,8 @@
 """Building blocks of the flow losses: robust penalties, masks, forward-backward consistency, SSIM, smoothness.
 
-Occlusion by forward-backward consistency after UnFlow (Meister et al., AAAI 2018); edge-aware smoothness and
-self-supervision after UFlow (Jonschkowski et al., ECCV 2020). Functions take one pair; `jax.vmap` for batches.
+Forward-backward consistency, its occlusion mask and second-order smoothness after UnFlow (Meister et al., AAAI 2018);
+edge-aware smoothness and self-supervision after UFlow (Jonschkowski et al., ECCV 2020). Functions take one pair;
+`jax.vmap` for batches.
 """
 
 from __future__ import annotations
@@ -13,11 +14,22 @@ from jaxtyping import Array, Bool, Float
 from ..core.numerics import safe_sqrt
 from ..image.warp import gather, pixel_grid
 
+_EPSILON = 0.001
+"""Of UnFlow's robust penalty, in the unit of its argument."""
+
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+"""(rows down, columns right) of UnFlow's second differences: along both axes and both diagonals."""
+
 
 def charbonnier(x: Float[Array, "*shape"], exponent: float, epsilon: float = 0.01) -> Float[Array, "*shape"]:
     """Robust penalty (|x| + epsilon)^exponent, after DDFlow and UFlow. Gradient 0 at 0."""
     magnitude = x * jax.lax.stop_gradient(jnp.sign(x))  # JAX's own |x| has gradient 1 at 0
     return (magnitude + epsilon) ** exponent
+
+
+def generalised_charbonnier(x: Float[Array, "*shape"], exponent: float = 0.45) -> Float[Array, "*shape"]:
+    """Robust penalty (x^2 + 0.001^2)^exponent of UnFlow, whose exponent is 0.45: then 0.002 at 0, with gradient 0."""
+    return (x * x + _EPSILON**2) ** exponent
 
 
 def masked_mean(values: Float[Array, "height width"], mask: Float[Array, "height width"]) -> Float[Array, ""]:
@@ -52,6 +64,22 @@ def consistency_error_px2(
     back, _ = gather(back_px, flow_px)
     gap = flow_px + back
     return jnp.sum(gap * gap, axis=-1), jnp.sum(flow_px * flow_px + back * back, axis=-1)
+
+
+def consistency_term(
+    flow_px: Float[Array, "height width 2"],
+    back_px: Float[Array, "height width 2"],
+    visible: Float[Array, "height width"],
+) -> Float[Array, ""]:
+    """Robust forward-backward error f + b(x + f): mean over both components and the visible pixels (UnFlow's
+    E_C).
+
+    Pixels whose target is outside `back_px` are left out. The gradient reaches both flows, the forward one also through
+    the position at which the backward one is sampled.
+    """
+    back, _ = gather(back_px, flow_px)
+    penalty = jnp.mean(generalised_charbonnier(flow_px + back), axis=-1)
+    return masked_mean(penalty, visible * jax.lax.stop_gradient(inside(flow_px).astype(flow_px.dtype)))
 
 
 def occluded(
@@ -99,6 +127,25 @@ def smoothness(
         weight = jnp.exp(-edge_weight * jnp.mean(jnp.abs(last - first), axis=-1))
         total = total + jnp.mean(weight * jnp.sum(safe_sqrt(change * change + 1e-6), axis=-1))
     return total / 2
+
+
+def second_order_term(flow_px: Float[Array, "height width 2"]) -> Float[Array, ""]:
+    """Robust second differences of the flow, without edge weights: sum over its components of the mean over the four
+    directions (UnFlow's E_S).
+
+    Each mean is over the pixels that have both neighbours: 0 if there are none.
+    """
+    height, width, _ = flow_px.shape
+    total = jnp.zeros(())
+    for down, right in _DIRECTIONS:
+        rows, columns = max(height - 2 * down, 0), max(width - 2 * abs(right), 0)
+        before, here, after = (
+            flow_px[top : top + rows, left : left + columns]
+            for top, left in ((down + n * down, abs(right) + n * right) for n in (-1, 0, 1))
+        )
+        penalty = generalised_charbonnier(before - 2 * here + after)
+        total = total + jnp.sum(penalty) / max(rows * columns, 1)
+    return total / len(_DIRECTIONS)
 
 
 def self_supervision_term(

@@ -1,8 +1,14 @@
 """Losses of optical flow without labels, and the loss of a student network against a teacher's flow.
 
-Multi-level census loss and forward-backward occlusion after UnFlow (Meister et al., AAAI 2018); full-image warping and
-sequence loss after SMURF (Stone et al., CVPR 2021). Functions take one pair; `jax.vmap` for batches. Masks carry no
-gradient: otherwise the network could lower its loss by declaring pixels occluded.
+Multi-level census loss, forward-backward occlusion and consistency, and second-order smoothness after UnFlow (Meister
+et al., AAAI 2018); full-image warping and sequence loss after SMURF (Stone et al., CVPR 2021). Functions take one pair;
+`jax.vmap` for batches. Masks carry no gradient: otherwise the network could lower its loss by declaring pixels occluded.
+
+Against UnFlow's published code: the data term and the consistency are means over the visible pixels, there sums over them
+divided by the number of all pixels, which is less by the visible fraction; a greater occlusion does not lower the loss
+here. Second differences are means over the pixels that have both neighbours, there divided by the number of all pixels.
+The two directions are averaged, there added, so that the whole loss is half as large. Pixels that leave the picture are left
+out and count as occluded; there the border of the picture does, a tenth of its shorter side, wherever its pixels move.
 """
 
 from __future__ import annotations
@@ -18,10 +24,24 @@ from ..core.numerics import safe_sqrt
 from ..image.census import census_distance, census_offsets, to_grey
 from ..image.warp import gather
 from ._layers import enlarge_flow, shrink
-from .loss_terms import charbonnier, crop_margin_px, inside, masked_mean, occluded, smoothness, ssim_distance
+from .loss_terms import (
+    charbonnier,
+    consistency_term,
+    crop_margin_px,
+    generalised_charbonnier,
+    inside,
+    masked_mean,
+    occluded,
+    second_order_term,
+    smoothness,
+    ssim_distance,
+)
 from .network import Levels
 
 Photometric = Literal["census", "photometric", "ssim"]
+
+_OF_LEVELS = ("consistency", "occlusion_penalty", "smooth_levels")
+"""UnFlow's terms, each named as its weight; computed only where that is above 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,10 +53,14 @@ class FlowLossSettings:
     census_stride: int = 3  # every n-th neighbour within the radius is compared
     level_weights: tuple[float, ...] = (1.0, 0.5, 0.4, 0.3, 0.2)  # finest first; coarser levels have weight 0
     sequence_decay: float = 0.0  # weight per update of a recurrent network, instead of level_weights; 0: off
-    robustness: float = 0.4  # exponent of the generalised Charbonnier function of the data term
+    robust_function: Literal["uflow", "unflow"] = "uflow"  # (|x| + 0.01)^r; or (x^2 + 0.001^2)^r, of the summed census
+    robustness: float = 0.4  # the exponent r of the data term
     smooth_first: float = 1.0
     smooth_second: float = 0.0
     edge_weight: float = 50.0  # factor of the mean absolute colour difference (0 to 1) of neighbours
+    smooth_levels: float = 0.0  # second differences in four directions, at every level, without edge weights (UnFlow)
+    consistency: float = 0.0  # forward-backward error of visible pixels, at every level (UnFlow)
+    occlusion_penalty: float = 0.0  # of each occluded pixel (UnFlow): part of the reported loss, without any gradient
     occlusion: bool = True
     occlusion_after: int = 500  # steps before which no pixel counts as occluded: an untrained network would occlude all
     occlusion_fraction: float = 0.01  # tolerance, as a fraction of the squared lengths of the two flows
@@ -53,6 +77,14 @@ class FlowLossSettings:
             raise ValueError(f"robustness is {self.robustness}; expected an exponent above 0 and at most 1.")
         if not 0 <= self.sequence_decay <= 1:
             raise ValueError(f"sequence_decay is {self.sequence_decay}; expected 0 (none) to 1.")
+        for name in _OF_LEVELS:
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected a weight of 0 or more.")
+            if getattr(self, name) > 0 and self.sequence_decay > 0:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)} and sequence_decay is {self.sequence_decay}; {name} is a term of a "
+                    "pyramid's levels, which a recurrent network has not: set one of the two to 0."
+                )
         if self.self_supervision_border_px < 1:
             raise ValueError(f"self_supervision_border_px is {self.self_supervision_border_px}; expected at least 1.")
         census_offsets(self.census_radius, self.census_stride)
@@ -64,10 +96,15 @@ def data_distance(
     settings: FlowLossSettings,
     level: int,
 ) -> Float[Array, "height width"]:
-    """Photometric distance of two aligned grey images, pixel by pixel, before the robust function."""
+    """Photometric distance of two aligned grey images, pixel by pixel, before the robust function.
+
+    The census is its mean over the neighbours times 48, the number at radius 3 (UFlow), or times their own number (UnFlow).
+    """
     if settings.data == "census":
         radius = max(1, settings.census_radius - level)
-        return 48 * census_distance(first, second, census_offsets(radius, settings.census_stride if radius > 1 else 1))
+        neighbours = 48 if settings.robust_function == "uflow" else (2 * radius + 1) ** 2 - 1
+        offsets = census_offsets(radius, settings.census_stride if radius > 1 else 1)
+        return neighbours * census_distance(first, second, offsets)
     if settings.data == "ssim":
         return ssim_distance(first, second)
     return first - second
@@ -92,7 +129,8 @@ def data_term(
     # Outside, the first image is inserted, so that the census of neighbouring pixels has no false edge.
     height, width = first.shape
     warped = jnp.where(inside(flow_px, margin), warped[margin : margin + height, margin : margin + width], first)
-    return masked_mean(charbonnier(data_distance(first, warped, settings, level), settings.robustness), visible)
+    penalty = charbonnier if settings.robust_function == "uflow" else generalised_charbonnier
+    return masked_mean(penalty(data_distance(first, warped, settings, level), settings.robustness), visible)
 
 
 def visible_mask(
@@ -127,14 +165,15 @@ def level_terms(
     """Data term and smoothness of one direction, summed over levels; with `occlusion_weight` 1 occluded pixels are left
     out.
 
-    `second` may extend beyond `first` (`data_term`) by a multiple of the coarsest level's stride. Smoothness applies to
-    the last level before the learned upsampling, which follows the image's edges by itself. Raises `ValueError` for a
-    margin that is no such multiple.
+    `second` may extend beyond `first` (`data_term`) by a multiple of the coarsest level's stride. Edge-aware smoothness
+    applies to the last level before the learned upsampling, which follows the image's edges by itself; UnFlow's terms, of
+    those that have a weight, to every level. Raises `ValueError` for a margin that is no such multiple.
     """
     height = first.shape[0]
     margin = crop_margin_px(first.shape, second.shape)
     data, first_order, second_order = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
     occluded_fraction = jnp.zeros(())
+    of_levels = {name: jnp.zeros(()) for name in _OF_LEVELS if getattr(settings, name) > 0}
     pairs = list(zip(forward[::-1], backward[::-1], strict=True))
     for level, (flow, back) in enumerate(pairs[: len(settings.level_weights)]):
         factor = height // flow.shape[0]
@@ -144,8 +183,11 @@ def level_terms(
         visible = visible_mask(flow, back, occlusion_weight, settings, margin // factor)
         if level == 0:
             occluded_fraction = 1 - jnp.mean(visible)
-        term = data_term(flow, to_grey(here), to_grey(there), visible, settings, level)
-        data = data + settings.level_weights[level] * term
+        weight = settings.level_weights[level]
+        if weight > 0:
+            data = data + weight * data_term(flow, to_grey(here), to_grey(there), visible, settings, level)
+            for name in of_levels:
+                of_levels[name] = of_levels[name] + weight * _term_of_level(name, flow, back, visible)
         if level == min(1, len(pairs) - 1):
             first_order = smoothness(flow, here, settings.edge_weight, 1)
             second_order = smoothness(flow, here, settings.edge_weight, 2)
@@ -154,7 +196,20 @@ def level_terms(
         "smooth_first": first_order,
         "smooth_second": second_order,
         "occluded_fraction": occluded_fraction,
+        **of_levels,
     }
+
+
+def _term_of_level(
+    name: str,
+    flow_px: Float[Array, "height width 2"],
+    back_px: Float[Array, "height width 2"],
+    visible: Float[Array, "height width"],
+) -> Float[Array, ""]:
+    """One of UnFlow's terms. The penalty is the fraction of pixels that are not visible, which has no gradient."""
+    if name == "consistency":
+        return consistency_term(flow_px, back_px, visible)
+    return second_order_term(flow_px) if name == "smooth_levels" else 1 - jnp.mean(visible)
 
 
 def sequence_terms(
@@ -231,4 +286,7 @@ def total_loss(terms: dict[str, Float[Array, ""]], settings: FlowLossSettings) -
     """The weighted sum of the terms, with the weights of the settings."""
     total = terms["data"] + settings.smooth_first * terms["smooth_first"]
     total = total + settings.smooth_second * terms["smooth_second"]
+    for name in _OF_LEVELS:
+        if name in terms:
+            total = total + getattr(settings, name) * terms[name]
     return total + settings.self_supervision * terms.get("self_supervision", jnp.zeros(()))

@@ -23,7 +23,6 @@ from ..core.machine import machine
 from ..core.results import write_json
 from ..flow.augmentation import AugmentationSettings
 from ..flow.estimates import NetworkFlow, forward_flow
-from ..flow.image_sequences import open_sequence
 from ..flow.losses import FlowLossSettings
 from ..flow.network import AbstractFlowNetwork
 from ..flow.networks import NETWORKS
@@ -34,7 +33,7 @@ from ..sim.flow_pairs import FlowPair
 from .checkpoint import Checkpoints
 from .devices import check_batch, unreplicate
 from .flow_config import TrainFlowConfig
-from .flow_sources import flow_dataset, installed_photographs, validation_pairs
+from .flow_sources import flow_dataset, installed_photographs, open_images, successive, validation_pairs
 from .flow_step import FlowTrainState, flow_step
 from .logging import Logger
 from .loop import resume_state, train
@@ -221,9 +220,7 @@ def _warped(config: TrainFlowConfig, learned: AbstractFlowNetwork) -> dict[str, 
         flows["before"] = NetworkFlow(initial_network(config.flow, config.weights))
     total = dict.fromkeys(flows, FlowScores())
     for path in config.data.sequences:
-        pictures = open_sequence(path, Path(config.data.drawn.folder))
-        for t in np.unique(np.linspace(0, pictures.shape[0] - 2, _WARPED_PAIRS).astype(int)):
-            first, second = np.asarray(pictures[t]), np.asarray(pictures[t + 1])
+        for first, second in successive(open_images(path, Path(config.data.drawn.folder)), _WARPED_PAIRS):
             for name, flow in flows.items():
                 total[name] = total[name].merge(FlowScores.of_pictures(first, second, flow(first, second)))
     results = {name: score.result()["warped_levels"] for name, score in total.items()}

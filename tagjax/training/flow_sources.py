@@ -18,11 +18,12 @@ from ..core.array_cache import cached_array, write_rows
 from ..core.stream import Stream
 from ..core.types import LazyArray
 from ..flow.augmentation import AugmentationSettings
+from ..flow.flying_chairs import FlyingChairs, is_flying_chairs
 from ..flow.image_pairs import PairSource, StackedPairs, TeacherPairs, pair_dataset
 from ..flow.image_sequences import open_sequence
 from ..sim.flow_pairs import FlowPair, FlowPairSettings, flow_pairs
 from ..sim.rendering.textures import PHOTOGRAPHS, photograph
-from .flow_teacher import cut_pairs, teacher_flow
+from .flow_teacher import cut_pairs, cut_stored_pairs, teacher_flow
 
 _BATCH = 16
 _SHARD = 128
@@ -54,7 +55,7 @@ class FlowDataSettings:
     """The training data of a flow network, and how pairs are cropped and augmented."""
 
     drawn: DrawnSettings = dataclasses.field(default_factory=DrawnSettings)
-    sequences: tuple[str, ...] = ()  # recordings, videos, folders of images; used without labels
+    sequences: tuple[str, ...] = ()  # recordings, videos, folders of images, FlyingChairs; used without labels
     sequence_fraction: float = 0.5  # fraction of the samples that is from sequences; the others are synthetic
     variation: AugmentationSettings = dataclasses.field(default_factory=AugmentationSettings)
     teacher: str | None = None  # a flow by name; its estimates are then the only training signal
@@ -148,21 +149,37 @@ def validation_pairs(settings: DrawnSettings) -> FlowPair:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
+def open_images(path: str, cache: Path) -> LazyArray | FlyingChairs:
+    """The images of `data.sequences`: a sequence (`open_sequence`), or the training pairs of a FlyingChairs folder, whose
+    flow is not read. Raises the errors of both.
+    """
+    folder = Path(path)
+    return FlyingChairs(folder, "training") if is_flying_chairs(folder) else open_sequence(path, cache)
+
+
+def successive(images: LazyArray | FlyingChairs, count: int) -> Iterator[UInt8[np.ndarray, "2 height width 3"]]:
+    """At most `count` pairs of an image and the next, evenly spaced; of FlyingChairs, of its pairs."""
+    pairs = images if isinstance(images, FlyingChairs) else None
+    last = images.shape[0] - (2 if pairs is None else 1)
+    for t in np.unique(np.linspace(0, last, count).astype(int)).tolist():
+        yield np.stack([np.asarray(images[t]), np.asarray(images[t + 1])]) if pairs is None else pairs[t]
+
+
 def flow_dataset(
     settings: FlowDataSettings, *, seed: int, progress: bool = True, shard: tuple[int, int] = (0, 1)
 ) -> Stream:
     """The endless stream of augmented pairs that the settings describe, or a shard of it; with the teacher's flow, if any."""
-    sequences = [open_sequence(path, Path(settings.drawn.folder)) for path in settings.sequences]
+    sequences = [open_images(path, Path(settings.drawn.folder)) for path in settings.sequences]
     lengths = [sequence.shape[0] for sequence in sequences]
     sequences_weight = settings.sequence_fraction if settings.drawn.num_pairs else 1.0
     sources: list[PairSource | StackedPairs | TeacherPairs] = []
     for number, sequence in enumerate(sequences):
         if settings.teacher is None:
-            sources.append(PairSource(sequence, settings.variation.gaps))
-            continue
-        size = settings.drawn.pairs.height, settings.drawn.pairs.width
-        cuts = cut_pairs(sequence, settings.cuts_per_sequence, size, settings.variation.gaps, seed=seed + number)
-        sources.append(_with_teacher(cuts, settings, settings.teacher, progress))
+            stored = isinstance(sequence, FlyingChairs)
+            sources.append(StackedPairs(sequence) if stored else PairSource(sequence, settings.variation.gaps))
+        else:
+            cuts = _cuts(sequence, settings, seed + number)
+            sources.append(_with_teacher(cuts, settings, settings.teacher, progress))
     weights = [sequences_weight * length / sum(lengths) for length in lengths]
     if (settings.drawn.num_pairs and sequences_weight < 1) or not sources:
         pairs = drawn_pairs(settings.drawn, progress=progress)
@@ -173,6 +190,14 @@ def flow_dataset(
         )
         weights.append(1 - sequences_weight if sequences else 1.0)
     return pair_dataset(sources, weights, settings.variation, seed=seed, workers=settings.workers, shard=shard)
+
+
+def _cuts(images: LazyArray | FlyingChairs, settings: FlowDataSettings, seed: int) -> np.ndarray:
+    """Crops of the synthetic pairs' size."""
+    size = settings.drawn.pairs.height, settings.drawn.pairs.width
+    if isinstance(images, FlyingChairs):
+        return cut_stored_pairs(images, settings.cuts_per_sequence, size, seed=seed)
+    return cut_pairs(images, settings.cuts_per_sequence, size, settings.variation.gaps, seed=seed)
 
 
 def _with_teacher(

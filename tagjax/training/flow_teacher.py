@@ -29,13 +29,8 @@ def cut_pairs(
 
     Raises `RecordingError` if the images are smaller than `size` or too few.
     """
-    pictures, height, width, _ = sequence.shape
-    rows, columns = size
-    if rows > height or columns > width:
-        raise RecordingError(
-            f"Pictures of {width} x {height} pixels; cuts for a student take {columns} x {rows}. "
-            "Make data.drawn.pairs.height and width smaller."
-        )
+    pictures = sequence.shape[0]
+    _check_size(sequence.shape[1:3], size)
     possible = [gap for gap in gaps if gap < pictures]
     if not possible:
         raise RecordingError(f"No two of {pictures} pictures are {' or '.join(map(str, gaps))} frames apart.")
@@ -45,14 +40,40 @@ def cut_pairs(
         gap = int(rng.choice(possible))
         frame = int(rng.integers(0, pictures - gap))
         both = np.stack([np.asarray(sequence[frame]), np.asarray(sequence[frame + gap])])
-        places = zip(
-            rng.integers(0, height - rows + 1, _NUM_CANDIDATES),
-            rng.integers(0, width - columns + 1, _NUM_CANDIDATES),
-            strict=True,
-        )
-        candidates = [both[:, top : top + rows, left : left + columns] for top, left in places]
-        cuts.append(max(candidates, key=lambda crop: float(np.mean(np.abs(crop[0].astype(np.float32) - crop[1])))))
+        cuts.append(_changing_crop(both, size, rng))
     return np.stack(cuts)
+
+
+def cut_stored_pairs(
+    pairs: LazyArray, count: int, size: tuple[int, int], *, seed: int
+) -> UInt8[np.ndarray, "count 2 height width 3"]:
+    """`cut_pairs` of stored pairs (pair, 2, height, width, 3), such as FlyingChairs: `count` crops of random ones."""
+    _check_size(pairs.shape[2:4], size)
+    rng = np.random.default_rng(seed)
+    numbers = rng.integers(0, pairs.shape[0], count)
+    return np.stack([_changing_crop(np.asarray(pairs[int(number)]), size, rng) for number in numbers])
+
+
+def _check_size(pictures: tuple[int, ...], size: tuple[int, int]) -> None:
+    if size[0] > pictures[0] or size[1] > pictures[1]:
+        raise RecordingError(
+            f"Pictures of {pictures[1]} x {pictures[0]} pixels; cuts for a student take {size[1]} x {size[0]}. "
+            "Make data.drawn.pairs.height and width smaller."
+        )
+
+
+def _changing_crop(
+    both: UInt8[np.ndarray, "2 _ _ 3"], size: tuple[int, int], rng: np.random.Generator
+) -> UInt8[np.ndarray, "2 height width 3"]:
+    """The candidate crop of a pair with the largest change."""
+    (_, height, width, _), (rows, columns) = both.shape, size
+    places = zip(
+        rng.integers(0, height - rows + 1, _NUM_CANDIDATES),
+        rng.integers(0, width - columns + 1, _NUM_CANDIDATES),
+        strict=True,
+    )
+    candidates = [both[:, top : top + rows, left : left + columns] for top, left in places]
+    return max(candidates, key=lambda crop: float(np.mean(np.abs(crop[0].astype(np.float32) - crop[1]))))
 
 
 def teacher_flow(
