@@ -175,6 +175,7 @@ def test_place_and_masks_teach_all_but_detection_and_the_confidence_detection_al
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.ci
 def test_only_the_named_parameters_learn(piece: Piece) -> None:
     settings = dataclasses.replace(SETTINGS, parameters=("reader.*", "body.temperature_nats"))
     gradient, _ = clip_gradient(TRACER, piece.camera, piece.frames, KEY, settings)
