@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 from tagjax.benchmarks.flow_speed import moved_pictures
 from tagjax.core.settings import ConfigError, from_mapping
-from tagjax.evaluation.flow import FlowEvaluationSettings, evaluate_flows, flow_tables
+from tagjax.evaluation.flow import FlowEvaluationSettings, _labels, evaluate_flows, flow_tables
 from tagjax.evaluation.flow_cases import drawn_material, folder_material, recording_material, sequence_material
 from tagjax.flow.flo_files import read_flo, write_flo
 from tagjax.flow.registry import make_flow
@@ -298,6 +298,25 @@ def test_scores_before_a_case_that_fails_are_kept_and_called_unfinished(scenes, 
         evaluate_flows(dataclasses.replace(settings, num_pairs=0), tmp_path / "nothing")
     assert not hasattr(found.value, "__notes__")
     assert not (tmp_path / "nothing").exists()
+
+
+def test_flows_have_short_names():
+    names = [
+        "dis",
+        "pyramid_fine+wls",
+        "runs/a/new.safetensors+rest",
+        "pyramid_mid:runs/a/new.safetensors",
+        "a/w.safetensors",
+        "b/w.safetensors",
+    ]
+    assert list(_labels(names)) == [
+        "dis",
+        "pyramid_fine+wls",
+        "new+rest",
+        "pyramid_mid:new",
+        "a/w.safetensors",
+        "b/w.safetensors",
+    ]
 
 
 def test_errors_are_drawn_against_times_where_both_are_known(tmp_path):

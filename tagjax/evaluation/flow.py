@@ -160,7 +160,9 @@ def _labels(names: Sequence[str]) -> dict[str, str]:
     short = []
     for name in names:
         flow, suffixes = split_suffixes(name)
-        short.append(Path(flow).stem + suffixes if Path(flow).suffix == ".safetensors" else name)
+        variant, colon, path = flow.rpartition(":")
+        stem = Path(path).stem if Path(path).suffix == ".safetensors" else path
+        short.append(variant + colon + stem + suffixes)
     return {stem if short.count(stem) == 1 else name: name for stem, name in zip(short, names, strict=True)}
 
 
