@@ -36,7 +36,7 @@ from tagjax.evaluation.reproduce.table import begin, filled, read_table, table_p
 from tagjax.metrics.interval import ratio_estimate
 from tagjax.metrics.recordings import RecordingResult, ScoreSettings
 from tagjax.metrics.tags import Scores
-from tagjax.sim.suites import Suite
+from tagjax.sim.suites import Item, Suite
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted((ROOT / "conf" / "table").glob("*.yaml"))
@@ -416,11 +416,20 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         return _result(path.stem)
 
     monkeypatch.setattr(Tracing, "trace", trace)
-    monkeypatch.setattr(
-        measuring,
-        "make_items",
-        lambda suite, folder, *, splits, workers, on_progress: [item for item in suite.items() if item.split in splits],
-    )
+    monkeypatch.setattr(measuring, "make_suite", lambda *_, **__: [])
+    return found
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch, traced: list[Path]) -> set[str]:
+    """Names of recordings that would have been simulated."""
+    found: set[str] = set()
+
+    def make_suite(suite: Suite, folder: Path, *, wanted: Callable[[Item], bool], **_: Any) -> list[Any]:
+        found.update(item.name for item in suite.items() if wanted(item))
+        return []
+
+    monkeypatch.setattr(measuring, "make_suite", make_suite)
     return found
 
 
@@ -453,11 +462,14 @@ def _whole_table(folder: Path, traced: list[Path]) -> dict[str, list[RecordingSc
 CHANGED_CODE = {"code/one.py": "3" * 40}
 
 
-def test_confirming_takes_over_what_scores_the_same(tmp_path: Path, traced: list[Path]):
+def test_confirming_takes_over_what_scores_the_same(tmp_path: Path, traced: list[Path], simulated: set[str]):
     before = _whole_table(tmp_path, traced)
+    assert len(simulated) == 4
+    simulated.clear()
     inputs = _inputs(tmp_path, code=CHANGED_CODE, revision="b" * 40)
     (found,) = measure(_recipe(), inputs, before=before, confirm=1).values()
     assert len(traced) == 1
+    assert simulated == {traced[0].stem}
     assert [one.revision[:1] for one in found if one.revision] == ["b", "a", "a", "a"]
     assert [one.sums for one in found] == [one.sums for one in next(iter(before.values()))]
 

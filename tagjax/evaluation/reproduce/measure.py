@@ -17,7 +17,7 @@ from ...core.results import to_json_values
 from ...core.settings import ConfigError, changed, from_mapping
 from ...metrics.recordings import RecordingResult, ScoreSettings, evaluate_recording, score_traces
 from ...recording.store import open_recording
-from ...sim.suites import Item, Suite, make_items
+from ...sim.suites import Item, Suite, make_suite
 from ...tagattention.tracer_settings import learned_tracer, make_tracer, settled, tracer_clips
 from ...tracing.clips import ClipSettings, clip_loader
 from ...tracing.tracer import AbstractTracer
@@ -58,14 +58,16 @@ def measure(
     Recordings that were traced before, by the same code with the same settings, are not traced again; an interruption
     loses only the recording in progress. With `confirm`, the first so many recordings of each job are traced; where they
     score as in `before` (by the job's name), the scores of the others are taken from there, if only the code has changed since
-    and no setting or parameter. Raises `ConfigError` for a
+    and no setting or parameter; only what is traced is simulated. Raises `ConfigError` for a
     suite or tracer that is not in `inputs`, for a split without recordings, and for `confirm` below 1.
     """
     if confirm is not None and confirm < 1:
         raise ConfigError(f"confirm is {confirm}; expected 1 or more recordings, or null to trace every one.")
     jobs = recipe.jobs()
     tracings = {job: _tracing(recipe, inputs, job) for job in jobs}  # wrong settings raise before the work starts
-    items = {draw: _items(inputs, *draw, on_progress) for draw in dict.fromkeys(map(_recordings_key, jobs))}
+    items = {draw: _items(inputs, *draw) for draw in dict.fromkeys(map(_recordings_key, jobs))}
+    for draw in items.values():
+        _simulate(draw[:confirm], inputs, on_progress)
     total = sum(len(items[_recordings_key(job)]) for job in jobs)
     numbers = itertools.count()
     scores: dict[Job, list[RecordingScores]] = {job: [] for job in jobs}
@@ -81,6 +83,7 @@ def measure(
                     or position < confirm
                     or known.settings != tracings[job].settings_hash(item)
                 ):
+                    _simulate([item], inputs, on_progress)
                     found = tracings[job].scores(item, inputs)
                     if known is None or not found.same_as(known, SCORES):
                         earlier[job] = {}  # the code scores otherwise than before: nothing of this job is taken over
@@ -180,18 +183,32 @@ def _recordings_key(job: Job) -> tuple[str, str, tuple[int, ...] | None]:
     return job.suite, job.split, job.seeds
 
 
-def _items(inputs: Inputs, name: str, split: str, seeds: Sequence[int] | None, report: OnProgress) -> list[Item]:
-    """The recordings of a suite's split with each of the seeds, simulated where they are missing."""
+def _items(inputs: Inputs, name: str, split: str, seeds: Sequence[int] | None) -> list[Item]:
+    """The recordings of a suite's split with each of the seeds."""
     own = from_mapping(Suite, _settings_by_name("suite", name, inputs.suites), where=f"suite {name}")
     suites = [own]
     if seeds is not None:
         suites = [dataclasses.replace(own, name=f"{own.name}-seed{seed}", seed=seed) for seed in seeds]
-    recordings: list[Item] = []
-    for suite in suites:
-        recordings += make_items(suite, inputs.recordings, splits=(split,), workers=inputs.workers, on_progress=report)
+    recordings = [item for suite in suites for item in suite.items() if item.split == split]
     if not recordings:
         raise ConfigError(f"suite {name}: found no {split} recording; choose another split, or raise its counts.")
     return recordings
+
+
+def _simulate(items: Sequence[Item], inputs: Inputs, report: OnProgress) -> None:
+    """Simulate those of the items that are missing."""
+    by_suite: dict[str, list[Item]] = {}
+    for item in items:
+        by_suite.setdefault(item.suite.name, []).append(item)
+    for ones in by_suite.values():
+        names = {one.name for one in ones}
+        make_suite(
+            ones[0].suite,
+            inputs.recordings,
+            workers=inputs.workers,
+            on_progress=report,
+            wanted=lambda one, names=names: one.name in names,
+        )
 
 
 def _settings_by_name(kind: str, name: str, known: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
