@@ -57,10 +57,12 @@ def _panel(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
         c=["C0" if error == least else "C1" for error, least in zip(error_px, best, strict=True)],
         zorder=3,
     )
-    for name, at, error in zip(order, ms, error_px, strict=True):
-        axes.annotate(name, (at, error), (5, 4), textcoords="offset points", fontsize=8)
+    for name, at, error, least in zip(order, ms, error_px, best, strict=True):
+        offset, side = ((-4, -11), "right") if error == least else ((5, 4), "left")
+        axes.annotate(name, (at, error), offset, textcoords="offset points", ha=side, fontsize=8)
     axes.set_xscale("log")
-    axes.set_xlim(ms[0] / 1.6, ms[-1] * 6)
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_xlim(ms[0] / 8, ms[-1] * 6)
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
