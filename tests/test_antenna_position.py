@@ -196,6 +196,7 @@ def _affine_phases(own: TagReads) -> np.ndarray:
     return phase % (2 * np.pi)
 
 
+@pytest.mark.ci
 def test_one_affine_offset_gives_the_position_exactly_without_noise() -> None:
     """Offsets with a slope over carriers, and pi flips."""
     own = reads()

@@ -154,6 +154,7 @@ def test_offline_finds_a_tag_before_its_first_motion_and_read():
         assert all(out.detected[tag] for out in offline[14:16])
 
 
+@pytest.mark.ci
 def test_with_nothing_to_come_offline_is_online():
     """At the last frame the backward pass has no read; where it begins it knows no body either."""
     one = scene(30)

@@ -32,7 +32,7 @@ def clip():
     return load_clip(recording, 0, NUM_FRAMES, stride=1, flow="dis", epcs=list(recording.reads.epcs))
 
 
-@pytest.mark.parametrize("without", [(), ("travel", "whole", "hidden")], ids=["whole tracer", "stages off"])
+@pytest.mark.parametrize("without", [(), ("whole", "hidden")], ids=["whole tracer", "stages off"])
 def test_labels_memberships_and_boxes_are_those_of_numpy(clip, without):
     tracer = dataclasses.replace(TRACER, **dict.fromkeys(without))
     depth_m = clip.frames.depth_m.at[20].set(0.0)  # a frame without depth
