@@ -139,7 +139,7 @@ def _seen_with(config: TrainConfig, settings: HindsightSettings) -> dict[str, An
     seen = {
         "clips": config.data.clips.arguments(),
         "control": config.data.control,
-        "virtual_tag": config.data.virtual_tag,
+        "virtual_tag": dataclasses.asdict(config.data.virtual_tag),
     }
     own = {} if settings.pieces else {"tracer": config.tracer, "weights": config.weights}
     return to_json_values({**seen, **own})
