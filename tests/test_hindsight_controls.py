@@ -114,8 +114,12 @@ def test_controls_count_as_the_fraction_of_reads_that_belong_to_nothing(piece: P
     np.testing.assert_allclose(loss["hindsight"], found.wrong / 80 / 3, rtol=1e-4)  # 1 of 4 to 3 of 4
     np.testing.assert_allclose(logged["false_confidence/control"], found.claimed / 80, rtol=1e-4)
     bare = dataclasses.replace(piece.frames, control=None)
-    _, fewer = eqx.filter_eval_shape(SETTINGS.terms, TRACER, piece.camera, bare)
-    assert set(fewer) == {"overlap", "place_nats", "false_confidence"}
+    with pytest.raises(ValueError, match="control"):
+        eqx.filter_eval_shape(SETTINGS.terms, TRACER, piece.camera, bare)
+    without = dataclasses.replace(SETTINGS, controls=0.0)
+    for frames in (bare, piece.frames):
+        _, fewer = eqx.filter_eval_shape(without.terms, TRACER, piece.camera, frames)
+        assert set(fewer) == {"overlap", "place_nats", "false_confidence"}
 
 
 def test_a_control_teaches_detection_its_true_slope_and_nothing_else(piece: Piece) -> None:
