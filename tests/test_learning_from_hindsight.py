@@ -249,6 +249,12 @@ def test_files_hold_the_pieces_and_are_made_once(piece: Piece, tmp_path: Path, m
         RecordingError, match=r'controls=false, teacher="smoother"; expected controls=true, teacher="labels"'
     ):
         make(teacher="labels", controls=True)
+    index = tmp_path / "pieces" / "index.json"
+    index.write_text(
+        json.dumps([{"recording": one["recording"], "files": one["files"]} for one in json.loads(index.read_text())])
+    )
+    with pytest.raises(RecordingError, match=r"found pieces made with clips=null.*; expected clips="):
+        make()
     files.remove()
     assert not (tmp_path / "pieces").exists()
 

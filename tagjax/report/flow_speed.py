@@ -51,14 +51,10 @@ def _panel(axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
     ms, error_px = np.array([points[name] for name in order]).T
     best = np.minimum.accumulate(error_px)
     axes.step([*ms, ms[-1] * 1.6], [*best, best[-1]], where="post", color="0.75", linewidth=1.5, zorder=1)
-    axes.scatter(
-        ms,
-        error_px,
-        c=["C0" if error == least else "C1" for error, least in zip(error_px, best, strict=True)],
-        zorder=3,
-    )
-    for name, at, error, least in zip(order, ms, error_px, best, strict=True):
-        offset, side = ((-4, -11), "right") if error == least else ((5, 4), "left")
+    ahead = error_px == best
+    axes.scatter(ms, error_px, c=np.where(ahead, "C0", "C1"), zorder=3)
+    for name, at, error, first in zip(order, ms, error_px, ahead, strict=True):
+        offset, side = ((-4, -11), "right") if first else ((5, 4), "left")
         axes.annotate(name, (at, error), offset, textcoords="offset points", ha=side, fontsize=8)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")

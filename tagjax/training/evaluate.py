@@ -70,6 +70,7 @@ def evaluate_tracers(
     lengths = [recordings[number].num_frames if frames is None else frames[1] - frames[0] for _, number in work]
     with progress_lines(shown=progress) as report:
         done, total = itertools.count(1), sum(lengths)
+        report("evaluate", 0, total)
         for name, number in work:
             recording, own = recordings[number], settings.supported_by(tracers[name])
             kept = overlay_folder(folder, names[number], labels[name])

@@ -159,10 +159,14 @@ def open_images(path: str, cache: Path) -> LazyArray | FlyingChairs:
 
 def successive(images: LazyArray | FlyingChairs, count: int) -> Iterator[UInt8[np.ndarray, "2 height width 3"]]:
     """At most `count` pairs of an image and the next, evenly spaced; of FlyingChairs, of its pairs."""
-    pairs = images if isinstance(images, FlyingChairs) else None
-    last = images.shape[0] - (2 if pairs is None else 1)
-    for t in np.unique(np.linspace(0, last, count).astype(int)).tolist():
-        yield np.stack([np.asarray(images[t]), np.asarray(images[t + 1])]) if pairs is None else pairs[t]
+    pairs = _pairs(images, (1,))
+    for number in np.unique(np.linspace(0, len(pairs) - 1, count).astype(int)).tolist():
+        yield pairs[number]
+
+
+def _pairs(images: LazyArray | FlyingChairs, gaps: Sequence[int]) -> PairSource | StackedPairs:
+    """All pairs of a sequence that are one of `gaps` frames apart; of FlyingChairs its pairs."""
+    return StackedPairs(images) if isinstance(images, FlyingChairs) else PairSource(images, gaps)
 
 
 def flow_dataset(
@@ -175,8 +179,7 @@ def flow_dataset(
     sources: list[PairSource | StackedPairs | TeacherPairs] = []
     for number, sequence in enumerate(sequences):
         if settings.teacher is None:
-            stored = isinstance(sequence, FlyingChairs)
-            sources.append(StackedPairs(sequence) if stored else PairSource(sequence, settings.variation.gaps))
+            sources.append(_pairs(sequence, settings.variation.gaps))
         else:
             cuts = _cuts(sequence, settings, seed + number)
             sources.append(_with_teacher(cuts, settings, settings.teacher, progress))

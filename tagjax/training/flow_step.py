@@ -138,7 +138,9 @@ def _update(
         return batch_loss(network, clean, augmented, state.step, settings, self_supervise=self_supervise)
 
     (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(learnable)
-    learnt, optimizer_state, usable = guarded_update(optimizer, gradient, value, state.optimizer_state, learnable)
+    learnt, optimizer_state, usable, logged = guarded_update(
+        optimizer, gradient, value, state.optimizer_state, learnable
+    )
     # The average starts as the mean of all steps, so that the influence of the first weights decays quickly.
     done = state.step.astype(jnp.float32)
     weight = jnp.maximum(1 / average_over, 1 / (done + 1))
@@ -151,9 +153,7 @@ def _update(
         state.step + 1,
         state.key,
     )
-    norm = optax.tree.norm(gradient)
-    numbers = {**terms, "loss": value, "gradient_norm": norm, "skipped": 1.0 - usable.astype(jnp.float32)}
-    return after, numbers
+    return after, {**terms, "loss": value, **logged}
 
 
 def flow_step(

@@ -111,15 +111,16 @@ def _step(key: Any, where: str) -> int:
 
 def guarded_update(
     optimizer: optax.GradientTransformation, gradient: PyTree, loss: Float[Array, ""], state: PyTree, learnable: PyTree
-) -> tuple[PyTree, PyTree, Bool[Array, ""]]:
-    """The arrays `learnable` and the optimiser's state after an update, and whether there was one: a loss or a gradient that
-    is not finite changes nothing.
+) -> tuple[PyTree, PyTree, Bool[Array, ""], dict[str, Float[Array, ""]]]:
+    """The arrays `learnable` and the optimiser's state after an update, whether there was one, and what to log of it: a loss
+    or a gradient that is not finite changes nothing.
     """
-    usable = jnp.isfinite(optax.tree.norm(gradient)) & jnp.isfinite(loss)
+    norm = optax.tree.norm(gradient)
+    usable = jnp.isfinite(norm) & jnp.isfinite(loss)
     safe = jax.tree.map(lambda g: jnp.where(usable, g, jnp.zeros_like(g)), gradient)
     with jax.numpy_dtype_promotion("standard"):  # Optax takes powers of its integer step count
         updates, after = optimizer.update(safe, state, learnable)
     moved = optax.apply_updates(learnable, updates)
     new, old = (moved, after), (learnable, state)
     (learnable, state) = jax.tree.map(lambda new, old: jnp.where(usable, new, old), new, old)
-    return learnable, state, usable
+    return learnable, state, usable, {"gradient_norm": norm, "skipped": 1.0 - usable.astype(jnp.float32)}

@@ -36,7 +36,7 @@ from .optimizers import build_optimizer
 from .processes import distributed_runtime, is_first, local_batch_size
 from .sources import training_recordings
 from .state import TrainState
-from .step import ClipLike, clip_loss, known_mean, make_joint_optimizer, make_optimizer, train_step
+from .step import ClipLike, clip_loss, make_joint_optimizer, make_optimizer, mean_logs, train_step
 
 
 def make_model(config: TrainConfig) -> AbstractTracer | JointModel:
@@ -237,8 +237,7 @@ def validation_metrics(state: TrainState, held_out: Iterable[ClipLike], config: 
     """
     key = jax.random.PRNGKey(config.seed)
     values = [clip_loss(state.model, sample.camera, sample.frames, key, config.learned) for sample in held_out]
-    names = values[0] if values else ()
-    return {name: float(known_mean([sample[name] for sample in values])) for name in names}
+    return {name: float(value) for name, value in mean_logs(values).items()} if values else {}
 
 
 def _describe(console: Console, training: Sequence[Recording], validation: Sequence[Recording]) -> None:

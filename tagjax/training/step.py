@@ -8,7 +8,7 @@ program runs on all devices; clips of other shapes (more tags, another camera) f
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -238,14 +238,19 @@ def known_mean(values: Sequence[Array]) -> Float[Array, ""]:
     return jnp.nanmean(jnp.stack([jnp.asarray(value) for value in values]))
 
 
+def mean_logs(logs: Sequence[Mapping[str, Array]]) -> dict[str, Float[Array, ""]]:
+    """The mean of each value that samples log, over those that have it. A loss that is not finite stays so."""
+    means = {name: known_mean([log[name] for log in logs]) for name in logs[0]}
+    return {**means, "loss": jnp.mean(jnp.stack([log["loss"] for log in logs]))}
+
+
 @eqx.filter_jit
 def _apply(
     state: TrainState, gradient: PyTree, loss: Array, optimizer: optax.GradientTransformation
 ) -> tuple[TrainState, dict[str, Array]]:
     learnable, static = eqx.partition(state.model, eqx.is_inexact_array)
-    learnable, optimizer_state, usable = guarded_update(optimizer, gradient, loss, state.optimizer_state, learnable)
-    done = TrainState(eqx.combine(learnable, static), optimizer_state, state.step + 1, state.key)
-    return done, {"gradient_norm": optax.tree.norm(gradient), "skipped": 1.0 - usable.astype(jnp.float32)}
+    learnable, optimizer_state, _, logged = guarded_update(optimizer, gradient, loss, state.optimizer_state, learnable)
+    return TrainState(eqx.combine(learnable, static), optimizer_state, state.step + 1, state.key), logged
 
 
 def train_step(
@@ -270,8 +275,6 @@ def train_step(
         total = gradient if total is None else jax.tree.map(jnp.add, total, gradient)
         logs.append(logged)
     mean = jax.tree.map(lambda leaf: leaf / len(clips), total)
-    averaged = {name: known_mean([log[name] for log in logs]) for name in logs[0] if name != "loss"}
-    averaged["loss"] = jnp.mean(jnp.stack([log["loss"] for log in logs]))
-    mean, averaged = mean_over_processes((mean, averaged))
+    mean, averaged = mean_over_processes((mean, mean_logs(logs)))
     state, more = _apply(state, mean, jnp.asarray(averaged["loss"]), optimizer)
     return state, {name: float(value) for name, value in {**averaged, **more}.items()}

@@ -83,7 +83,8 @@ def measure(
                     or position < confirm
                     or known.settings != tracings[job].settings_hash(item)
                 ):
-                    _simulate([item], inputs, on_progress)
+                    if confirm is not None and position >= confirm:  # the others are there
+                        _simulate([item], inputs, on_progress)
                     found = tracings[job].scores(item, inputs)
                     if known is None or not found.same_as(known, SCORES):
                         earlier[job] = {}  # the code scores otherwise than before: nothing of this job is taken over
@@ -197,13 +198,10 @@ def _items(inputs: Inputs, name: str, split: str, seeds: Sequence[int] | None) -
 
 def _simulate(items: Sequence[Item], inputs: Inputs, report: OnProgress) -> None:
     """Simulate those of the items that are missing."""
-    by_suite: dict[str, list[Item]] = {}
-    for item in items:
-        by_suite.setdefault(item.suite.name, []).append(item)
-    for ones in by_suite.values():
+    for suite, ones in itertools.groupby(items, key=lambda item: item.suite):
         names = {one.name for one in ones}
         make_suite(
-            ones[0].suite,
+            suite,
             inputs.recordings,
             workers=inputs.workers,
             on_progress=report,

@@ -21,7 +21,7 @@ def content_id(path: Path) -> str:
     if path.suffix == ".py":
         content = _code(content.decode()).encode()
     elif path.suffix == ".yaml":
-        content = json.dumps(yaml.safe_load(content)).encode()
+        content = json.dumps(yaml.safe_load(content), default=str).encode()
     return hashlib.sha1(content, usedforsecurity=False).hexdigest()
 
 
@@ -72,10 +72,11 @@ def revision(root: Path, files: Iterable[str]) -> dict[str, Any]:
     """
     commit = _git(root, "rev-parse", "HEAD")
     changed = _git(root, "diff", "--name-only", "--relative", "-z", "HEAD")
-    new = _git(root, "ls-files", "--others", "-z")
-    if commit is None or changed is None or new is None:
+    tracked = _git(root, "ls-files", "-z")
+    if commit is None or changed is None or tracked is None:
         return {"commit": None, "dirty": None, "modified": []}
-    modified = sorted({*changed.split("\0"), *new.split("\0")}.intersection(files))
+    asked = {*files}
+    modified = sorted(asked.intersection(changed.split("\0")) | asked.difference(tracked.split("\0")))
     return {"commit": commit.strip(), "dirty": bool(modified), "modified": modified}
 
 

@@ -90,7 +90,7 @@ class PieceFiles:
 
     def _check_made_with(self, made_with: Mapping[str, Any]) -> None:
         for one in self._index():
-            found = one["made_with"]
+            found = one.get("made_with", {})  # none of a folder of before
             if other := sorted(name for name in {*found, *made_with} if found.get(name) != made_with.get(name)):
                 raise RecordingError(
                     f"{self.folder}: found pieces made with {_values(other, found)}; expected {_values(other, made_with)}. "
